@@ -1,0 +1,173 @@
+"""Two-view geometry: projection, epipolar lines, triangulation, distortion of points.
+
+HZ is Hartley & Zisserman, Multiple View Geometry in Computer Vision, 2nd edition. Pixel centres lie at integer
+coordinates, u to the right, v down. Nothing here looks at an image.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.linalg import rq
+
+from .data import Distortion, View
+
+MIN_PLANE_ANGLE = np.deg2rad(5.0)   # below it depth is a guess: triangulation errors grow as 1 / sin(angle)
+
+
+class GeometryError(ValueError):
+    """Numbers that can't be a camera, or a pair of cameras that can't see depth; the message says which."""
+
+
+def make_view(name: str, P, width: int, height: int, distortion: Distortion | None = None) -> View:
+    """A View of plane `name` from a (3, 4) projection in metres to pixels, scaled so that w is the depth in m.
+
+    Raises GeometryError where P can't be a camera.
+    """
+    P = np.asarray(P, float)
+    if P.shape != (3, 4) or not np.isfinite(P).all():
+        raise GeometryError(f'plane {name}: the projection matrix is not 3x4 and finite')
+    scale = np.linalg.norm(P[2, :3])
+    if scale == 0 or abs(np.linalg.det(P[:, :3] / np.abs(P[:, :3]).max())) < 1e-12:
+        raise GeometryError(f'plane {name}: the projection matrix is zero or singular')
+    view = View(name, P / scale, int(width), int(height), distortion)
+    K, _, _ = decompose(view.P)
+    if min(abs(K[0, 0]), abs(K[1, 1])) < 1.0:
+        raise GeometryError(f'plane {name}: a focal length of {min(abs(K[0, 0]), abs(K[1, 1])):.3g} px is no camera')
+    return view
+
+
+def decompose(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K (3, 3), R (3, 3) and t (3,) of P = K [R | t] (HZ 6.2.4); K[2, 2] = 1, det R = 1, K[1, 1] > 0; a mirrored image has K[0, 0] < 0."""
+    K, R = rq(P[:, :3])
+    signs = np.where(np.diag(K) < 0, -1.0, 1.0)
+    K, R = K * signs, signs[:, None] * R
+    if np.linalg.det(R) < 0:
+        K[:, 0], R[0] = -K[:, 0], -R[0]
+    return K / K[2, 2], R, np.linalg.solve(K, P[:, 3])
+
+
+def source(P: np.ndarray) -> np.ndarray:
+    """(3,) position of the X-ray source in the reference frame, m: the null vector of P (HZ 6.2.4)."""
+    return -np.linalg.solve(P[:, :3], P[:, 3])
+
+
+def plane_angle(views: tuple[View, View]) -> float:
+    """Angle between the two viewing directions, rad, in [0, pi/2]: 0 where they are parallel or opposite."""
+    a, b = (v.P[2, :3] for v in views)     # unit: see View.P
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)))
+
+
+def check_pair(views: tuple[View, View]) -> None:
+    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel without a baseline."""
+    sources = [source(v.P) for v in views]
+    baseline = np.linalg.norm(sources[0] - sources[1])
+    depth = max(np.linalg.norm(s) for s in sources) + 1e-3
+    if baseline < 1e-3:
+        raise GeometryError(f'the sources of planes a and b coincide ({baseline * 1000:.2g} mm apart): no depth can be seen')
+    # A rectified stereo pair has parallel axes but sees depth through its baseline; biplane sees it through the angle.
+    if plane_angle(views) < MIN_PLANE_ANGLE and baseline < 0.02 * depth:
+        raise GeometryError(f'planes a and b are parallel ({np.rad2deg(plane_angle(views)):.2g} degrees): no depth can be seen')
+
+
+def project(P: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """(..., 2) undistorted pixels of (..., 3) points in m; NaN or inf where a point lies in the source's plane."""
+    x = X @ P[:, :3].T + P[:, 3]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return x[..., :2] / x[..., 2:]
+
+
+def depth(P: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """(...) distance in m of (..., 3) points from the source along the viewing axis; negative behind it."""
+    return X @ P[2, :3] + P[2, 3]
+
+
+def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """(..., 2, 3) derivative of `project`, px per m."""
+    x = X @ P[:, :3].T + P[:, 3]
+    return (P[:2, :3] - (x[..., :2] / x[..., 2:])[..., None] * P[2, :3]) / x[..., 2, None, None]
+
+
+def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
+    """Magnification at the mean of (N, 3) points: image px per m across the viewing ray."""
+    K, _, _ = decompose(P)
+    return float(np.sqrt(abs(K[0, 0] * K[1, 1])) / abs(np.mean(depth(P, X))))
+
+
+def isocenter(views: tuple[View, View]) -> np.ndarray:
+    """(3,) m, the point nearest to both central rays (through the image centres): where a biplane system looks."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for v in views:
+        d = np.linalg.solve(v.P[:, :3], [(v.width - 1) / 2, (v.height - 1) / 2, 1.0])
+        across = np.eye(3) - np.outer(d, d) / (d @ d)
+        A, b = A + across, b + across @ source(v.P)
+    return np.linalg.lstsq(A, b, rcond=None)[0]
+
+
+def fundamental(Pa: np.ndarray, Pb: np.ndarray) -> np.ndarray:
+    """(3, 3) F with x_b^T F x_a = 0, unit norm: F = [e_b]x P_b P_a^+ (HZ eq. 9.1)."""
+    e = Pb @ np.append(source(Pa), 1.0)
+    F = np.cross(np.eye(3), e).T @ Pb @ np.linalg.pinv(Pa)
+    return F / np.linalg.norm(F)
+
+
+def epipolar_lines(F: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+    """(N, 3) lines l = F x, one a point of (N, 2); normalised, so that l . (u, v, 1) is the signed distance in px."""
+    lines = points_px @ F[:, :2].T + F[:, 2]
+    return lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+
+
+def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarray, iterations: int = 10) -> np.ndarray:
+    """(N, 3) points in m that minimise the squared reprojection error of (N, 2) undistorted pixels.
+
+    Starts at the linear solution (HZ 12.2) and takes Newton steps on the reprojection error (Gauss-Newton Hessian),
+    all points at once. NaN where a point can't be triangulated.
+    """
+    A = np.stack([a_px[:, 0, None] * Pa[2] - Pa[0], a_px[:, 1, None] * Pa[2] - Pa[1],
+                  b_px[:, 0, None] * Pb[2] - Pb[0], b_px[:, 1, None] * Pb[2] - Pb[1]], axis=1)
+    bad = ~np.isfinite(A).all(axis=(1, 2))
+    A[bad] = 0.0
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        H = np.einsum('nij,nik->njk', A[:, :, :3], A[:, :, :3])
+        g = np.einsum('nij,ni->nj', A[:, :, :3], A[:, :, 3])
+        bad |= np.abs(np.linalg.det(H / (np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-300))) < 1e-15
+        H[bad] = np.eye(3)
+        X = -np.linalg.solve(H, g[..., None])[..., 0]
+        for _ in range(iterations):
+            r = np.concatenate([project(Pa, X) - a_px, project(Pb, X) - b_px], axis=1)
+            J = np.concatenate([projection_jacobian(Pa, X), projection_jacobian(Pb, X)], axis=1)
+            H = np.einsum('nij,nik->njk', J, J)
+            g = np.einsum('nij,ni->nj', J, r)
+            wild = ~np.isfinite(H).all(axis=(1, 2)) | ~np.isfinite(g).all(axis=1)
+            bad |= wild
+            H[bad], g[bad] = np.eye(3), 0.0
+            step = np.linalg.solve(H, g[..., None])[..., 0]
+            X = X - step
+            if np.abs(step).max(initial=0.0) < 1e-9:
+                break
+    return np.where(bad[:, None], np.nan, X)
+
+
+def undistort(view: View, points_px: np.ndarray) -> np.ndarray:
+    """(N, 2) pixels of the ideal pinhole P for (N, 2) pixels of the image as received."""
+    d = view.distortion
+    if d is None or len(points_px) == 0:
+        return np.asarray(points_px, float)
+    K, _, _ = decompose(view.P)
+    p = np.ascontiguousarray(points_px, float)[:, None]
+    if d.model == 'equidistant':
+        return cv2.fisheye.undistortPoints(p, d.K, d.D, R=d.R, P=K)[:, 0]
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-9)
+    return cv2.undistortPointsIter(p, d.K, d.D, d.R, K, criteria)[:, 0]
+
+
+def distort(view: View, points_px: np.ndarray) -> np.ndarray:
+    """(N, 2) pixels of the image as received for (N, 2) pixels of the ideal pinhole P: the inverse of `undistort`."""
+    d = view.distortion
+    if d is None or len(points_px) == 0:
+        return np.asarray(points_px, float)
+    K, _, _ = decompose(view.P)
+    rays = np.c_[points_px, np.ones(len(points_px))] @ (d.R.T @ np.linalg.inv(K)).T
+    if d.model == 'equidistant':
+        return cv2.fisheye.distortPoints(np.ascontiguousarray(rays[:, None, :2] / rays[:, None, 2:]), d.K, d.D)[:, 0]
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), d.K, d.D)[0][:, 0]

@@ -1,0 +1,1 @@
+"""Robot shapes, C-arm geometry and two independent renderers with known truth."""

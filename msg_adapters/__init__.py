@@ -1,0 +1,1 @@
+"""Free functions between ROS messages and arrays; usable without a running node."""
