@@ -1,0 +1,34 @@
+"""What all command line tools share: exit codes and one-line errors."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+
+class ToolError(Exception):
+    """A failure the tool can name in one line: exit code 1."""
+
+
+def run(body, parser: argparse.ArgumentParser, argv=None) -> int:
+    """Parse `argv` and call `body(args)`. Returns the exit code: 0, 1 for a ToolError or OSError (one line on stderr), 130 for Ctrl-C.
+
+    argparse itself exits with 2 for unusable arguments; `parser.error` does the same for what only `body` can find.
+    """
+    args = parser.parse_args(argv)
+    try:
+        return body(args) or 0
+    except (ToolError, OSError) as error:
+        print(f'{parser.prog}: {" ".join(str(error).split())}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+def need(module: str, extra: str):
+    """The imported `module`, or a ToolError that names the extra to install."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ToolError(f'needs {module.split(".")[0]}, which is not installed here ({error}): pip install "fluoro_shape_ros[{extra}]"') from error
