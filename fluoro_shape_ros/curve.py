@@ -1,0 +1,44 @@
+"""Curves in 3-D and in images: arc length, resampling, curvature."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+
+def arc_length(points: np.ndarray) -> np.ndarray:
+    """(N,) length along the (N, d) polyline from its first point."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def at_arc_length(points: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """(M, d) points of the (N, d) polyline at the (M,) arc lengths `s`."""
+    along = arc_length(points)
+    return np.stack([np.interp(s, along, c) for c in points.T], axis=1)
+
+
+def even_steps(length: float, step: float) -> np.ndarray:
+    """0, step, 2 step, ... and exactly `length`; only the last step may be shorter."""
+    s = np.arange(0.0, length, step)
+    if length - s[-1] < 1e-6 * step and len(s) > 1:    # a rounding error is no step
+        s = s[:-1]
+    return np.append(s, length)
+
+
+def resample(points: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """A cubic spline through (N, 3) points, at equal arc-length steps: (M, 3) points whose last one is the last given, and (M,) arc lengths."""
+    points = points[np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-12)]
+    spline = CubicSpline(arc_length(points), points, bc_type='natural') if len(points) > 2 else None
+    if spline is not None:
+        u = np.linspace(0.0, spline.x[-1], max(20 * len(points), int(8 * spline.x[-1] / step) + 2))
+        points = spline(u)
+    s = even_steps(arc_length(points)[-1], step)
+    return at_arc_length(points, s), s
+
+
+def curvature(points: np.ndarray) -> np.ndarray:
+    """(N - 2,) curvature, 1/m, of the circle through each three successive points of (N, 3) (Menger)."""
+    a, b = np.diff(points, axis=0)[:-1], np.diff(points, axis=0)[1:]
+    c = points[2:] - points[:-2]
+    sides = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1) * np.linalg.norm(c, axis=1)
+    return 2 * np.linalg.norm(np.cross(a, b), axis=1) / np.maximum(sides, 1e-30)

@@ -1,0 +1,38 @@
+"""Where an image shows X-ray at all: not collimator blades, not the corners around a circular intensifier."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+SHRINK = 4              # the field is found at a quarter of the resolution
+DARK = 0.12             # darker than this share of the bright level counts as not exposed
+OPENING = 9             # small-image px: a device is thinner, a blade is wider
+
+
+def field_of_view(image: np.ndarray) -> np.ndarray:
+    """(H, W) uint8 mask, 255 where the (H, W) image is exposed.
+
+    Unexposed is what is dark, wider than any device and connected with the image's border.
+    """
+    h, w = image.shape
+    small = cv2.resize(image, (-(-w // SHRINK), -(-h // SHRINK)), interpolation=cv2.INTER_AREA).astype(np.float32)
+    small -= min(0.0, float(small.min()))
+    dark = (small < DARK * np.percentile(small, 95)).astype(np.uint8)
+    framed = cv2.copyMakeBorder(dark, OPENING, OPENING, OPENING, OPENING, cv2.BORDER_REPLICATE)
+    framed = cv2.morphologyEx(framed, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OPENING, OPENING)))
+    dark = framed[OPENING:-OPENING, OPENING:-OPENING]
+    _, labels = cv2.connectedComponents(dark)
+    outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    blocked = np.isin(labels, outside[outside > 0])
+    return cv2.resize((~blocked).astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_NEAREST)
+
+
+def border_distance(field: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+    """(N,) distance in px of (N, 2) points from the border of the exposed field (the image's border included), to about SHRINK px."""
+    small = np.ascontiguousarray(field[::SHRINK, ::SHRINK])
+    distance = cv2.distanceTransform(cv2.copyMakeBorder(small, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    h, w = field.shape
+    i = np.clip(np.round(points_px / SHRINK).astype(int), 0, np.array(small.shape)[::-1] - 1)
+    to_edge = np.min(np.c_[points_px, np.array([w, h]) - 1 - points_px], axis=1)
+    return np.minimum((distance[i[:, 1], i[:, 0]] - 0.5) * SHRINK, to_edge)
