@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from .config import Config
 from .curve import curvature
 from .data import Outcome
-
-import numpy as np
 
 
 def curvature_limit(config: Config, metres_per_px: float) -> float:
@@ -27,4 +27,12 @@ def check_length(length: float, config: Config) -> tuple[Outcome, str] | None:
     bounds = config.plausibility.expected_length
     if bounds and not bounds[0] <= length <= bounds[1]:
         return Outcome.LENGTH, f'length {length * 1000:.1f} mm is outside [{bounds[0] * 1000:.1f}, {bounds[1] * 1000:.1f}] mm'
+    return None
+
+
+def check_reprojection(residuals_px: np.ndarray, config: Config) -> tuple[Outcome, str] | None:
+    """Median of the (N, 2) residuals of each plane: None, or the rejection."""
+    worst = float(np.nanmedian(residuals_px, axis=0).max())
+    if worst > config.plausibility.max_reprojection_px:
+        return Outcome.REPROJECTION, f'median reprojection residual {worst:.1f} px exceeds {config.plausibility.max_reprojection_px:g} px'
     return None
