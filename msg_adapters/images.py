@@ -1,0 +1,122 @@
+"""sensor_msgs/Image and CompressedImage to arrays and back.
+
+Any object with the fields of the message will do: rclpy's and rosbags' messages alike. Grey values keep their depth; nothing is
+scaled or cut to 8 bits.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from .messages import New, header
+
+
+class BadImage(ValueError):
+    """An image message that can't be what it says; the message tells why."""
+
+
+@dataclass(frozen=True)
+class _Encoding:
+    dtype: np.dtype
+    channels: int = 1
+    to_grey: int | None = None      # OpenCV colour conversion
+
+
+_U8, _U16, _F32 = np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32)
+ENCODINGS = {
+    'mono8': _Encoding(_U8),
+    '8UC1': _Encoding(_U8),
+    'mono16': _Encoding(_U16),
+    '16UC1': _Encoding(_U16),
+    '32FC1': _Encoding(_F32),
+    'bgr8': _Encoding(_U8, 3, cv2.COLOR_BGR2GRAY),
+    'rgb8': _Encoding(_U8, 3, cv2.COLOR_RGB2GRAY),
+}
+_WRITTEN_AS = {(_U8, 2): 'mono8', (_U16, 2): 'mono16', (_F32, 2): '32FC1', (_U8, 3): 'bgr8'}     # by dtype and number of dimensions
+
+
+def image_to_array(msg) -> np.ndarray:
+    """(H, W) uint8, uint16 or float32 in native byte order, from a sensor_msgs/Image.
+
+    A read-only view of the message's memory where that is possible: one channel, native byte order, aligned.
+    Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, and values that are not finite.
+    """
+    if msg.encoding not in ENCODINGS:
+        raise BadImage(f'encoding "{msg.encoding}" is not one of {", ".join(ENCODINGS)}')
+    encoding = ENCODINGS[msg.encoding]
+    height, width, step = int(msg.height), int(msg.width), int(msg.step)
+    if height == 0 or width == 0:
+        raise BadImage(f'the image is empty: {width}x{height}')
+    item = encoding.dtype.itemsize * encoding.channels
+    if step < width * item:
+        raise BadImage(f'step {step} is too small: {width} {msg.encoding} pixels need {width * item} bytes a row')
+    size = len(msg.data)
+    # the last row may come without its padding
+    if not (height - 1) * step + width * item <= size <= height * step:
+        raise BadImage(f'data has {size} bytes, but {height} rows of step {step} need {height * step}')
+    order = '>' if msg.is_bigendian else '<'
+    strides = (step, item, encoding.dtype.itemsize)
+    # np.ndarray rather than reshape: a step need not be a multiple of the item size
+    array = np.ndarray((height, width, encoding.channels), encoding.dtype.newbyteorder(order), _bytes(msg.data), strides=strides)
+    array = np.require(array, encoding.dtype, 'A')      # to native order and alignment, a copy only where they differ
+    if encoding.to_grey is not None:
+        return cv2.cvtColor(np.ascontiguousarray(array), encoding.to_grey)
+    return _checked(array[:, :, 0])
+
+
+def _bytes(data) -> memoryview:
+    """The buffer of a message's data, read-only and without copying it: array.array, ndarray, bytes and memoryview alike."""
+    return np.frombuffer(data, np.uint8).data.toreadonly()
+
+
+def _checked(array: np.ndarray) -> np.ndarray:
+    # min and max carry NaN and infinity along, at a fraction of the cost of isfinite over all pixels
+    if array.dtype.kind == 'f' and not np.isfinite([array.min(), array.max()]).all():
+        raise BadImage(f'{int((~np.isfinite(array)).sum())} pixels are not finite')
+    return array
+
+
+def compressed_to_array(msg) -> np.ndarray:
+    """(H, W) uint8, uint16 or float32 from a sensor_msgs/CompressedImage: whatever OpenCV decodes, JPEG, PNG and 16-bit PNG among it; colour becomes grey.
+
+    Raises BadImage where the data is no image.
+    """
+    if len(msg.data) == 0:
+        raise BadImage('the compressed image has no data')
+    try:
+        array = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise BadImage(f'the compressed image ("{msg.format}") can\'t be decoded: {error.err}') from error
+    if array is None:
+        raise BadImage(f'the compressed image ("{msg.format}", {len(msg.data)} bytes) can\'t be decoded')
+    return grey(array)
+
+
+def grey(array: np.ndarray) -> np.ndarray:
+    """(H, W) of an image as OpenCV reads it: grey, BGR or BGRA; uint8, uint16 or float32. Raises BadImage for any other."""
+    if array.dtype not in (_U8, _U16, _F32):
+        raise BadImage(f'pixels of type {array.dtype} are not supported: uint8, uint16 and float32 are')
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    elif array.ndim == 3 and array.shape[2] in (3, 4):
+        array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY if array.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+    if array.ndim != 2:
+        raise BadImage(f'an array of shape {array.shape} is no image')
+    return _checked(array)
+
+
+def array_to_image(array: np.ndarray, stamp_ns: int, frame_id: str, new: New):
+    """A sensor_msgs/Image of an (H, W) uint8 (mono8), uint16 (mono16) or float32 (32FC1), or an (H, W, 3) uint8 (bgr8) array.
+
+    `new` is a factory (see messages). Raises BadImage for any other array.
+    """
+    encoding = _WRITTEN_AS.get((array.dtype.newbyteorder('='), array.ndim))
+    if encoding is None or 0 in array.shape or (array.ndim == 3 and array.shape[2] != 3):
+        raise BadImage(f'no image encoding for an array of type {array.dtype} and shape {array.shape}')
+    native = np.ascontiguousarray(array, ENCODINGS[encoding].dtype)
+    return new('sensor_msgs/msg/Image', header=header(new, stamp_ns, frame_id), height=array.shape[0], width=array.shape[1], encoding=encoding,
+               is_bigendian=int(sys.byteorder == 'big'), step=native.strides[0], data=native.reshape(-1).view(np.uint8))
