@@ -157,8 +157,10 @@ def undistort(view: View, points_px: np.ndarray) -> np.ndarray:
     p = np.ascontiguousarray(points_px, float)[:, None]
     if d.model == 'equidistant':
         return cv2.fisheye.undistortPoints(p, d.K, d.D, R=d.R, P=K)[:, 0]
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-9)
-    return cv2.undistortPointsIter(p, d.K, d.D, d.R, K, criteria)[:, 0]
+    ideal = cv2.undistortPoints(p, d.K, d.D, R=d.R, P=K)[:, 0]
+    for _ in range(10):         # OpenCV stops after five fixed-point steps; go on in the same way to sub-pixel agreement
+        ideal = ideal - (distort(view, ideal) - p[:, 0])
+    return ideal
 
 
 def distort(view: View, points_px: np.ndarray) -> np.ndarray:

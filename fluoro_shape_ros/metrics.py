@@ -1,0 +1,39 @@
+"""How far a reconstructed backbone lies from the true one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .curve import arc_length, at_arc_length
+
+DENSE = 0.05e-3     # m: both curves are sampled this finely, so that distances to points are distances to curves
+
+
+@dataclass(frozen=True)
+class Errors:
+    """All in metres."""
+
+    mean: float         # mean distance of the reconstructed curve to the closest point of the true one (the paper's measure)
+    missed: float       # the same the other way round: truth that was not reconstructed shows here
+    worst: float        # largest of both directions (Hausdorff)
+    tip: float          # distance of the tips
+    length: float       # |difference of the lengths|
+    matched: float      # mean distance at equal arc length from the tip, over the common length
+
+
+def compare(points: np.ndarray, truth: np.ndarray) -> Errors:
+    """Errors of (N, 3) backbone points against the (M, 3) true backbone, both base to tip, m."""
+    found, true = _dense(points), _dense(truth)
+    to_true, to_found = cKDTree(true).query(found)[0], cKDTree(found).query(true)[0]
+    n = min(len(found), len(true))
+    return Errors(float(to_true.mean()), float(to_found.mean()), float(max(to_true.max(), to_found.max())), float(np.linalg.norm(found[-1] - true[-1])),
+                  abs(float(arc_length(found)[-1] - arc_length(true)[-1])), float(np.linalg.norm(found[-n:] - true[-n:], axis=1).mean()))
+
+
+def _dense(points: np.ndarray) -> np.ndarray:
+    """Equal steps of DENSE counted from the tip, so that equal indices from the end are equal arc lengths from the tip."""
+    length = arc_length(points)[-1]
+    return at_arc_length(points[::-1], np.arange(0.0, length, DENSE))[::-1]

@@ -1,0 +1,131 @@
+"""Two-view geometry against hand-derived answers."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from fluoro_shape_ros.data import Distortion
+from fluoro_shape_ros.geometry import (GeometryError, check_pair, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
+                                       pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
+
+K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])
+# plane A looks along +z from z = -1, plane B along +x from x = -1
+Pa = K @ np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]])
+Pb = K @ np.array([[0, 0, -1.0, 0], [0, 1, 0, 0], [1, 0, 0, 1]])
+A, B = make_view('a', Pa, 101, 81), make_view('b', Pb, 101, 81)
+
+
+def test_projection_by_hand():
+    assert_allclose(project(A.P, np.array([[0.01, 0.02, 0.0], [0.0, 0.0, 1.0]])), [[60, 60], [50, 40]])
+    assert_allclose(depth(A.P, np.array([[0, 0, 0.5], [0, 0, -2.0]])), [1.5, -1.0])
+
+
+def test_scale_of_p_does_not_matter():
+    assert_allclose(make_view('a', 7 * Pa, 101, 81).P, A.P)
+
+
+def test_jacobian_is_the_derivative_of_project():
+    X, h = np.array([0.01, -0.02, 0.03]), 1e-6
+    numeric = np.stack([(project(B.P, X + h * e) - project(B.P, X - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
+    assert_allclose(projection_jacobian(B.P, X[None])[0], numeric, rtol=1e-6)
+
+
+def test_decompose_gives_back_k_and_pose():
+    k, R, t = decompose(A.P)
+    assert_allclose(k, K, atol=1e-9)
+    assert_allclose(R, np.eye(3), atol=1e-12)
+    assert_allclose(t, [0, 0, 1], atol=1e-12)
+
+
+def test_mirrored_image_decomposes_with_negative_focal_length():
+    k, R, t = decompose(np.diag([-1.0, 1, 1]) @ Pa)
+    assert k[0, 0] < 0 < k[1, 1]
+    assert_allclose(np.linalg.det(R), 1)
+    assert_allclose(k @ np.c_[R, t], np.diag([-1.0, 1, 1]) @ Pa, atol=1e-9)
+
+
+def test_source_angle_isocenter_magnification():
+    assert_allclose(source(A.P), [0, 0, -1], atol=1e-12)
+    assert_allclose(plane_angle((A, B)), np.pi / 2)
+    assert_allclose(isocenter((A, B)), [0, 0, 0], atol=1e-9)
+    assert_allclose(pixels_per_metre(A.P, np.zeros((1, 3))), 1000)
+
+
+def test_corresponding_points_lie_on_epipolar_lines():
+    X = np.random.default_rng(0).uniform(-0.02, 0.02, (20, 3))
+    a, b = project(A.P, X), project(B.P, X)
+    F = fundamental(A.P, B.P)
+    for F_, p, q in ((F, a, b), (F.T, b, a)):
+        assert_allclose(np.einsum('ni,ni->n', epipolar_lines(F_, p), np.c_[q, np.ones(20)]), 0, atol=1e-9)
+
+
+def test_epipolar_line_by_hand():
+    # The plane through both sources and the isocentre is y = 0: row v = 40 in both images.
+    line = epipolar_lines(fundamental(A.P, B.P), np.array([[50.0, 40.0]]))[0]
+    assert_allclose(abs(line), [0, 1, 40], atol=1e-9)
+
+
+def test_triangulation_is_exact_without_noise():
+    X = np.random.default_rng(1).uniform(-0.02, 0.02, (50, 3))
+    assert_allclose(triangulate(A.P, B.P, project(A.P, X), project(B.P, X)), X, atol=1e-12)
+
+
+def test_triangulation_minimises_the_reprojection_error():
+    rng = np.random.default_rng(2)
+    X = rng.uniform(-0.02, 0.02, (10, 3))
+    a, b = project(A.P, X) + rng.normal(0, 1, (10, 2)), project(B.P, X) + rng.normal(0, 1, (10, 2))
+
+    def cost(Y):
+        return ((project(A.P, Y) - a) ** 2 + (project(B.P, Y) - b) ** 2).sum(1)
+    Y = triangulate(A.P, B.P, a, b)
+    for d in np.r_[np.eye(3), -np.eye(3)] * 1e-6:
+        assert (cost(Y + d) > cost(Y)).all()
+
+
+def test_triangulation_answers_nan_for_unusable_pixels():
+    Y = triangulate(A.P, B.P, np.array([[50.0, 40.0], [np.nan, 1.0]]), np.array([[50.0, 40.0], [1.0, 1.0]]))
+    assert_allclose(Y[0], 0, atol=1e-9)
+    assert np.isnan(Y[1]).all()
+
+
+@pytest.mark.parametrize('P, reason', [
+    (np.zeros((3, 4)), 'zero or singular'), (np.full((3, 4), np.nan), 'finite'), (np.eye(3), '3x4'),
+    (np.r_[Pa[:2], [[0, 0, 0, 1.0]]], 'zero or singular'), (np.eye(3, 4) * 1e-3 + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1, 0]], 'focal length')])
+def test_what_cannot_be_a_camera_is_named(P, reason):
+    with pytest.raises(GeometryError, match=f'plane a.*{reason}'):
+        make_view('a', P, 101, 81)
+
+
+def test_planes_that_see_no_depth_are_named():
+    with pytest.raises(GeometryError, match='coincide'):
+        check_pair((A, make_view('b', Pa, 101, 81)))
+    shifted = Pa.copy()
+    shifted[:, 3] += K @ [0.005, 0, 0]
+    with pytest.raises(GeometryError, match='parallel'):
+        check_pair((A, make_view('b', shifted, 101, 81)))
+    check_pair((A, B))
+
+
+@pytest.mark.parametrize('model, D', [('plumb_bob', [-0.2, 0.05, 1e-3, -2e-3, 0.01]), ('rational_polynomial', [0.3, 0.1, 0, 0, 0.02, 0.1, 0.05, 0.01]),
+                                      ('equidistant', [0.02, -0.01, 0.003, 0.0])])
+def test_distortion_is_removed_and_put_back(model, D):
+    view = make_view('a', Pa, 101, 81, Distortion(model, K, np.array(D), np.eye(3)))
+    px = np.array([[0.0, 0], [100, 80], [50, 40], [20, 70]])
+    ideal = undistort(view, px)
+    assert_allclose(ideal[2], [50, 40], atol=1e-9)       # the principal point stays
+    assert np.abs(ideal - px).max() > 1e-3
+    assert_allclose(distort(view, ideal), px, atol=1e-5)
+
+
+def test_plumb_bob_by_hand():
+    # radial k1 only: x_d = x (1 + k1 r^2); at x = 0.05, k1 = 2: 0.05 * 1.005 = 0.05025 -> u = 100.25
+    view = make_view('a', Pa, 101, 81, Distortion('plumb_bob', K, np.array([2.0, 0, 0, 0, 0]), np.eye(3)))
+    assert_allclose(distort(view, np.array([[100.0, 40.0]])), [[100.25, 40]], atol=1e-9)
+    assert_allclose(undistort(view, np.array([[100.25, 40.0]])), [[100, 40]], atol=1e-6)
+
+
+def test_rectifying_rotation_is_applied():
+    c, s = np.cos(0.01), np.sin(0.01)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    view = make_view('a', Pa, 101, 81, Distortion('plumb_bob', K, np.zeros(5), R))
+    assert_allclose(undistort(view, np.array([[50.0, 40.0]])), [[50 + 1000 * np.tan(0.01), 40]], atol=1e-6)
