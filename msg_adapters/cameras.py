@@ -1,0 +1,96 @@
+"""sensor_msgs/CameraInfo to the View of a plane.
+
+Any object with the fields of the message will do: rclpy's and rosbags' messages alike.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fluoro_shape_ros.data import Distortion, View
+from fluoro_shape_ros.geometry import GeometryError, make_view
+
+COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}      # how many D may have
+
+
+class BadCameraInfo(ValueError):
+    """A CameraInfo that can't be a camera, or not this image's; the message tells why."""
+
+
+def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectified: bool = False, pose=None) -> View:
+    """The View of plane `name` ('a' or 'b') for an image of `image_shape` (H, W) as received, from a sensor_msgs/CameraInfo.
+
+    `P` maps the reference frame (m) to pixels; with `pose`, a pair R (3, 3), t (3,) of camera_from_reference, only its left 3x3 counts.
+    `rectified` says that the image is free of distortion already: D and R are ignored. K and P refer to the full resolution;
+    the image may be a region of it (`roi`) and binned. Raises BadCameraInfo.
+    """
+    try:
+        to_image = _image_from_full(msg, image_shape)
+        K, P = _matrix(msg.k, 'K', (3, 3)), _matrix(msg.p, 'P', (3, 4))
+        distortion = None if rectified else _distortion(msg, to_image @ K)
+        if pose is not None:
+            P = P[:, :3] @ np.c_[pose[0], pose[1]]
+    except BadCameraInfo as error:
+        raise BadCameraInfo(f'plane {name}: {error}') from None
+    try:
+        return make_view(name, to_image @ P, image_shape[1], image_shape[0], distortion)
+    except GeometryError as error:
+        raise BadCameraInfo(str(error)) from error
+
+
+def _image_from_full(msg, image_shape: tuple[int, int]) -> np.ndarray:
+    """(3, 3) homography from pixels of the full resolution to those of the received image, whose size it checks."""
+    full = np.array([msg.width, msg.height], float)
+    if not full.all():
+        raise BadCameraInfo(f'the size in CameraInfo is {msg.width}x{msg.height}')
+    offset = np.array([msg.roi.x_offset, msg.roi.y_offset], float)
+    region = np.where([msg.roi.width, msg.roi.height], [msg.roi.width, msg.roi.height], full)   # 0: all of it
+    if (offset + region > full).any():
+        raise BadCameraInfo(f'its roi ({region[0]:g}x{region[1]:g} at {offset[0]:g}, {offset[1]:g}) leaves the sensor ({msg.width}x{msg.height})')
+    binning = np.maximum([msg.binning_x, msg.binning_y], 1)     # 0: none
+    width, height = (region // binning).astype(int)
+    if (height, width) != tuple(image_shape):
+        raise BadCameraInfo(f'CameraInfo is for {width}x{height} images (roi and binning counted), but the image is {image_shape[1]}x{image_shape[0]}')
+    # pixel centres lie at integers: u = (u_full - offset + 1/2) / binning - 1/2
+    return np.array([[1 / binning[0], 0.0, (0.5 - offset[0]) / binning[0] - 0.5],
+                     [0.0, 1 / binning[1], (0.5 - offset[1]) / binning[1] - 0.5],
+                     [0.0, 0.0, 1.0]])
+
+
+def _matrix(values, name: str, shape: tuple[int, int]) -> np.ndarray:
+    """An intrinsic or projection matrix from its row-major entries."""
+    m = _finite(values, name)
+    if m.size != shape[0] * shape[1]:
+        raise BadCameraInfo(f'{name} has {m.size} entries instead of {shape[0] * shape[1]}')
+    m = m.reshape(shape)
+    if not m.any():
+        raise BadCameraInfo(f'{name} is zero: the camera is not calibrated')
+    if abs(np.linalg.det(m[:, :3] / np.abs(m[:, :3]).max(initial=1e-300))) < 1e-12:
+        raise BadCameraInfo(f'{name} is singular')
+    return m
+
+
+def _finite(values, name: str) -> np.ndarray:
+    m = np.array(values, float)
+    if not np.isfinite(m).all():
+        raise BadCameraInfo(f'{name} has entries that are not finite')
+    return m
+
+
+def _distortion(msg, K: np.ndarray) -> Distortion | None:
+    """What `undistort` needs of the raw image with intrinsics `K`, or None where the image is a pinhole's."""
+    model, D, R = msg.distortion_model, _finite(msg.d, 'D'), _finite(msg.r, 'R').reshape(3, 3)
+    if not R.any():     # never filled in
+        R = np.eye(3)
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise BadCameraInfo('R is no rotation')
+    if model and model not in COEFFICIENTS:
+        raise BadCameraInfo(f'distortion model "{model}" is not one of {", ".join(COEFFICIENTS)}')
+    if model and D.size and D.size not in COEFFICIENTS[model]:
+        raise BadCameraInfo(f'{model} has {D.size} coefficients instead of {" or ".join(map(str, COEFFICIENTS[model]))}')
+    if not model and D.any():
+        raise BadCameraInfo(f'D is given, but no distortion model: it must be one of {", ".join(COEFFICIENTS)}')
+    if D.any():
+        return Distortion(model, K, D, R)
+    # as image_geometry has it, D of zeros is a pinhole under every model; R then still turns the rays
+    return None if np.allclose(R, np.eye(3), atol=1e-9) else Distortion('plumb_bob', K, np.zeros(5), R)
