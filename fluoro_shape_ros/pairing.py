@@ -1,8 +1,8 @@
-"""Pairs the images of the two planes by their stamps; one of the two places that remember."""
+"""What stamps decide: which images make a pair, and which camera holds for an image."""
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -106,6 +106,12 @@ class Pairer:
         """Number of frames that wait for a partner."""
         return sum(len(p.stamps) for p in self._planes.values())
 
+    @property
+    def gap_ns(self) -> int | None:
+        """How far plane B's newest stamp is ahead of plane A's; None before both have sent."""
+        a, b = self._planes.values()
+        return None if a.newest is None or b.newest is None else b.newest - a.newest
+
     def _newest_pair(self) -> tuple | None:
         a, b = self._planes.values()
         if not a.stamps or not b.stamps:
@@ -131,3 +137,55 @@ class Pairer:
         self.counts.pairs += 1
         self.counts.unpaired += a.drop(i + 1) + b.drop(j + 1) - 2
         return pair
+
+
+class CameraBook:
+    """Which camera holds for an image of one plane: the newest one stamped at or before it.
+
+    Only changes are kept. An image older than every camera takes the oldest known one.
+    """
+
+    def __init__(self):
+        self._stamps, self._cameras = [], []    # of the changes, by stamp
+        self._newest = None                     # stamp of the last camera, changed or not
+        self._asked = None                      # stamp of the last image
+        self._with_images = False               # whether cameras come with the images, stamp by stamp
+
+    def add(self, stamp_ns: int, camera) -> None:
+        """Take in a camera (anything that can be compared) that holds from `stamp_ns` on."""
+        if self._newest is not None and stamp_ns < self._newest - JUMP_NS:
+            self.rewind(stamp_ns)
+        self._newest = max(stamp_ns, self._newest or 0)
+        self._with_images |= stamp_ns == self._asked
+        k = bisect_right(self._stamps, stamp_ns)
+        if k == 0 or self._cameras[k - 1] != camera:
+            self._stamps.insert(k, stamp_ns)
+            self._cameras.insert(k, camera)
+            del self._stamps[:-BUFFER], self._cameras[:-BUFFER]
+
+    def at(self, stamp_ns: int):
+        """The camera that holds for an image, or None where none is known."""
+        if not self._cameras:
+            return None
+        return self._cameras[max(bisect_right(self._stamps, stamp_ns) - 1, 0)]
+
+    def awaits(self, stamp_ns: int) -> bool:
+        """Whether an image came before its camera: cameras have been coming with the images, but this one's is still on its way."""
+        self._asked = stamp_ns
+        self._with_images |= stamp_ns == self._newest
+        return self._with_images and self._newest < stamp_ns
+
+    def give_up(self) -> None:
+        """Cameras come no longer with the images: stop waiting for them, until they do again."""
+        self._with_images = False
+
+    def rewind(self, stamp_ns: int) -> None:
+        """The stamps jumped back to `stamp_ns`: forget later changes. With nothing else left, the newest camera goes on."""
+        if self._newest is None or self._newest <= stamp_ns:
+            return
+        last = self._cameras[-1]
+        k = bisect_right(self._stamps, stamp_ns)
+        del self._stamps[k:], self._cameras[k:]
+        if not self._cameras:
+            self._stamps, self._cameras = [stamp_ns], [last]
+        self._newest = stamp_ns - 1
