@@ -1,2 +1,55 @@
+"""All metadata is here: [project] in pyproject.toml would break `colcon build --symlink-install`."""
+
+from glob import glob
+from pathlib import Path
+
 from setuptools import find_packages, setup
-setup(name='fluoro_shape_ros', version='0.1.0', packages=find_packages(exclude=['test', 'test.*']))
+
+NAME = 'fluoro_shape_ros'
+EXECUTABLES = {
+    'fluoro_shape_node': 'fluoro_shape_ros.node',
+    'fluoro_shape_sim': 'fluoro_shape_ros.tools.sim',
+    'fluoro_shape_import': 'fluoro_shape_ros.tools.importer',
+    'fluoro_shape_replay': 'fluoro_shape_ros.tools.replay',
+    'fluoro_shape_bench': 'fluoro_shape_ros.tools.bench',
+    'fluoro_shape_demo': 'fluoro_shape_ros.tools.demo',
+}
+
+# real ROS 2 Jazzy as wheels; where ROS is installed (or there are no wheels) the extra is empty
+WHEELS = '; sys_platform == "linux" and platform_machine == "x86_64"'
+EXTRAS = {
+    'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp')],
+    'bags': ['rosbags>=0.10'],
+    'dicom': ['pydicom>=2.4'],
+    'vtk': ['vtk>=9.3'],
+    'plot': ['matplotlib>=3.6'],
+}
+EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
+EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
+EXTRAS['test'] = [*EXTRAS['all'], 'pytest>=7.4']
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='3-D backbone and tip of a continuum robot, needle or catheter from biplane fluoroscopy, live on ROS 2',
+    long_description=(Path(__file__).resolve().parent / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    author='fluoro_shape_ros maintainers',
+    author_email='maintainers@fluoro-shape.example',
+    maintainer='fluoro_shape_ros maintainers',
+    maintainer_email='maintainers@fluoro-shape.example',
+    license='Apache-2.0',
+    keywords=['ROS', 'fluoroscopy', 'continuum robot', 'shape sensing'],
+    packages=find_packages(include=[f'{NAME}*', 'msg_adapters*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml', *sorted(glob('resource/*.xml') + glob('resource/*.yaml') + glob('resource/*.rviz') + glob('resource/*.json'))]),
+        # `ros2 run` looks in lib/<package>; pip puts the entry points below in bin/ only
+        (f'lib/{NAME}', [f'resource/bin/{name}' for name in EXECUTABLES]),
+    ],
+    entry_points={'console_scripts': [f'{name} = {module}:main' for name, module in EXECUTABLES.items()]},
+    python_requires='>=3.11',
+    install_requires=['numpy>=1.26.4', 'scipy>=1.11.4', 'opencv-python-headless>=4.6', 'scikit-image>=0.22', 'tqdm>=4.60'],
+    extras_require=EXTRAS,
+    zip_safe=True,
+)
