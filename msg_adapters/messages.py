@@ -7,6 +7,7 @@ sequences may be given as numpy arrays of any shape, `byte` fields as int. Readi
 from __future__ import annotations
 
 import array
+import functools
 import importlib
 from collections.abc import Callable
 
@@ -20,10 +21,16 @@ _TYPECODES = {'uint8': 'B', 'octet': 'B', 'int8': 'b', 'uint16': 'H', 'int16': '
 
 def ros_message(type_name: str, **fields):
     """A real ROS message of type 'package/msg/Name'; imports the class when first asked. Raises ImportError where ROS is not installed."""
+    cls, kinds = _ros_class(type_name)
+    return cls(**{key: _ros_value(kinds[key], value) for key, value in fields.items()})
+
+
+@functools.cache
+def _ros_class(type_name: str) -> tuple[type, dict[str, str]]:
+    """The class and the types of its fields by name; a Path asks for the same four hundreds of times."""
     package, _, name = type_name.split('/')
     cls = getattr(importlib.import_module(f'{package}.msg'), name)
-    kinds = cls.get_fields_and_field_types()
-    return cls(**{key: _ros_value(kinds[key], value) for key, value in fields.items()})
+    return cls, cls.get_fields_and_field_types()
 
 
 def _ros_value(kind: str, value):
