@@ -1,0 +1,135 @@
+"""Seeded scenes: a pair of images with its views and its true backbone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..data import Frame
+from ..geometry import project
+from . import anatomy as surroundings
+from . import carm, placement, shapes, vtk_scene, xray
+
+FRAME_ID = 'isocenter'
+LENGTHS = (0.067, 0.188)            # m (Burgner et al. 2011)
+RADIUS = 0.0006                     # m
+CLUTTER = ('leads', 'wire', 'blades', 'field', 'occluder', 'text')
+RENDERERS = ('vtk', 'xray')
+DEVICE, BACKGROUND = 0.12, 0.75     # grey levels of protocol P
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A pair of images and what is true of it."""
+
+    frame: Frame
+    truth: np.ndarray           # (N, 3) m, dense, base to tip: the part of the backbone that stands in both fields
+    radius: float               # m
+    base_position: np.ndarray   # (3,) m, the first true point
+    name: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """What stays the same while a device moves: a fluoroscopic run. `scene` renders a moment of it."""
+
+    name: str
+    seed: int
+    fields: tuple[placement.Field, placement.Field]
+    shape: shapes.Spline | shapes.Cannula
+    shaft: float                                # m of straight shaft before the shape
+    radius: float                               # m
+    renderer: str                               # one of RENDERERS
+    exposure: xray.Exposure | None = None       # None: protocol P's grey levels, blur and noise
+    beams: tuple[np.ndarray, np.ndarray] | None = None     # (H, W) float32 each, transmission without the device; None: open
+    text: bool = False                          # burnt in at the border
+
+    def backbone(self, t: float = 0.0) -> np.ndarray:
+        """(N, 3) the whole device at `t` s of its motion, with what of its shaft lies outside the fields."""
+        return placement.with_shaft(shapes.moving(self.shape, t).backbone(), self.shaft)
+
+    def scene(self, t: float = 0.0, index: int = 0, stamp_ns: int = 0) -> Scene:
+        """The pair at `t` s of the motion (0: as drawn); `index` picks the noise."""
+        whole = self.backbone(t)
+        rng = np.random.default_rng([self.seed, 1, index])
+        images = tuple(self._image(whole, i, rng) for i in (0, 1))
+        truth = placement.seen_in_both(whole, self.fields)
+        views = tuple(f.view for f in self.fields)
+        return Scene(Frame(stamp_ns, FRAME_ID, images, views), truth, self.radius, truth[0], self.name, self.seed)
+
+    def _image(self, whole: np.ndarray, i: int, rng: np.random.Generator) -> np.ndarray:
+        view = self.fields[i].view
+        if self.exposure is None:
+            return vtk_scene.degrade(grey(whole, self.radius, view, self.renderer), rng)
+        beam = xray.transmission(whole, self.radius, view, self.exposure)
+        image = xray.expose(beam if self.beams is None else beam * self.beams[i], self.exposure, rng)
+        return surroundings.burn_in(image) if self.text else image
+
+
+def grey(backbone: np.ndarray, radius: float, view, renderer: str) -> np.ndarray:
+    """(H, W) float32: a device of grey level DEVICE on BACKGROUND, noise-free, by either renderer.
+
+    The X-ray one is as dark where the beam crosses the device's axis, and brighter towards its edges.
+    """
+    if renderer == 'vtk':
+        return vtk_scene.render(backbone, radius, view, DEVICE, BACKGROUND)
+    return np.float32(BACKGROUND) * xray.transmission(backbone, radius, view, xray.Exposure(contrast=1 - DEVICE / BACKGROUND))
+
+
+def protocol_p_run(seed: int, renderer: str = 'vtk', kind: str = 'spline', entering: bool = False, angle: float = np.pi / 2) -> Run:
+    """The simulation of Burgner et al. 2011: 1024x1024, 0.523 mm a pixel at the isocentre, planes `angle` rad apart (there 90 degrees)."""
+    if renderer not in RENDERERS:
+        raise ValueError(f'no renderer is called {renderer!r}: there are {", ".join(RENDERERS)}')
+    fields = tuple(placement.Field(v) for v in carm.biplane(angle_b=(angle, 0.0), arm=carm.CArm(pixel_size_iso=0.523e-3)))
+    shape, shaft = placement.place(np.random.default_rng([seed, 0]), fields, kind, LENGTHS, entering)
+    return Run(f'p_{renderer}_{kind}', seed, fields, shape, shaft, RADIUS, renderer)
+
+
+def protocol_p(seed: int, renderer: str = 'vtk', **options) -> Scene:
+    """A still scene of `protocol_p_run`, which takes the same options."""
+    return protocol_p_run(seed, renderer, **options).scene()
+
+
+def xray_run(seed: int, *, arm: carm.CArm = carm.CArm(), angle_a=(0.0, 0.0), angle_b=(np.pi / 2, 0.0), exposure: xray.Exposure = xray.Exposure(),
+             anatomy: bool = True, clutter: tuple[str, ...] = (), kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS, entering: bool = False) -> Run:
+    """A run that looks like fluoroscopy: a metal device in front of an anatomy-like background and any of CLUTTER.
+
+    Angles are (primary, secondary) in rad, lengths (shortest, longest) in m. An occluder hides a part of the device in plane B only.
+    """
+    if unknown := set(clutter) - set(CLUTTER):
+        raise ValueError(f'no clutter is called {", ".join(sorted(unknown))}: there are {", ".join(CLUTTER)}')
+    views = carm.biplane(angle_a, angle_b, arm)
+    size = (arm.height, arm.width)
+    apertures = [_aperture(np.random.default_rng([seed, 2, i]), size, clutter) for i in (0, 1)]
+    fields = tuple(placement.lit_field(v, a) for v, a in zip(views, apertures))
+    shape, shaft = placement.place(np.random.default_rng([seed, 0]), fields, kind, lengths, entering)
+    beams = []
+    for i, (view, aperture) in enumerate(zip(views, apertures)):
+        rng = np.random.default_rng([seed, 3, i])
+        beam = np.ones(size, np.float32) if aperture is None else aperture
+        if anatomy:
+            beam = beam * surroundings.anatomy(rng, size)
+        if 'leads' in clutter:
+            beam = beam * surroundings.leads(rng, size)
+        if 'wire' in clutter:
+            second = shapes.random_spline(np.random.default_rng([seed, 4]), 0.4, max_curvature=8.0).backbone()
+            beam = beam * xray.transmission(second, 0.6 * radius, view, xray.Exposure(contrast=0.6 * exposure.contrast))
+        if 'occluder' in clutter and i == 1:
+            beam = beam * surroundings.occluder(rng, size, np.median(project(view.P, shape.backbone()), axis=0))
+        beams.append(beam)
+    return Run('_'.join(['xray', kind, *clutter]), seed, fields, shape, shaft, radius, 'xray', exposure, tuple(beams), 'text' in clutter)
+
+
+def xray_scene(seed: int, *, pixel_size_iso: float = 0.3e-3, photons: float = 1500.0, contrast: float = 0.25, depth: int = 8,
+               angle: float = np.pi / 2, **options) -> Scene:
+    """A still scene of `xray_run`, planes `angle` rad apart; `options` are those of `xray_run`."""
+    exposure = xray.Exposure(photons=photons, contrast=contrast, depth=depth)
+    return xray_run(seed, arm=carm.CArm(pixel_size_iso=pixel_size_iso), angle_b=(angle, 0.0), exposure=exposure, **options).scene()
+
+
+def _aperture(rng: np.random.Generator, size: tuple[int, int], clutter: tuple[str, ...]) -> np.ndarray | None:
+    """What collimator blades and the intensifier's circle let through; None where there are neither."""
+    parts = [make(rng, size) for name, make in (('blades', surroundings.blades), ('field', surroundings.intensifier)) if name in clutter]
+    return np.prod(parts, axis=0) if parts else None

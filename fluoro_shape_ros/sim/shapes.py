@@ -1,0 +1,140 @@
+"""Robot shapes with known backbones: random smooth splines and a two-tube active cannula, still or moving.
+
+A shape is a frozen set of parameters. Its `backbone()` is the (N, 3) curve in the reference frame, m, base to tip, in equal
+arc-length steps, the last point exactly the tip. In the shape's own frame the base is the origin and its tangent is +x.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+STEP = 1e-4             # m, arc-length step of a backbone
+MAX_CURVATURE = 40.0    # 1/m: no bend tighter than a radius of 25 mm
+KNOT_SPACING = 0.025    # m of arc between the directions a random spline is drawn through
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a shape's base stands in the reference frame."""
+
+    base: np.ndarray = field(default_factory=lambda: np.zeros(3))       # (3,) m
+    heading: np.ndarray = field(default_factory=lambda: np.eye(3))      # (3, 3) rotation, shape to reference frame
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) points of the shape's own frame in the reference frame."""
+        return points @ self.heading.T + self.base
+
+
+@dataclass(frozen=True)
+class Spline:
+    """A smooth curve whose direction (yaw, pitch) is a cubic spline of arc length."""
+
+    length: float                           # m
+    bends: np.ndarray                       # (K, 2) yaw and pitch at knots KNOT_SPACING apart, rad
+    pose: Pose = field(default_factory=Pose)
+
+    def angles(self) -> CubicSpline:
+        """Arc length (m) to yaw and pitch (rad)."""
+        return CubicSpline(np.arange(len(self.bends)) * KNOT_SPACING, self.bends)
+
+    def backbone(self, step: float = STEP) -> np.ndarray:
+        """(N, 3) m. The tangent is a unit vector by construction, so arc length is exact; its integral is the curve."""
+        s = _steps(self.length, step)
+        yaw, pitch = self.angles()(s).T
+        tangent = np.c_[np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
+        return self.pose.apply(CubicSpline(s, tangent).antiderivative()(s))
+
+
+@dataclass(frozen=True)
+class Cannula:
+    """A two-tube active cannula: the section where both tubes lie, then the inner tube alone; each bends with constant curvature.
+
+    Rotations are those of the tubes at the base; equal ones keep the cannula in one plane.
+    """
+
+    outer_length: float                     # m
+    outer_curvature: float                  # 1/m, 0: straight
+    outer_rotation: float                   # rad about the base tangent
+    inner_length: float                     # m that the inner tube reaches beyond the outer
+    inner_curvature: float                  # 1/m
+    inner_rotation: float                   # rad about the base tangent
+    pose: Pose = field(default_factory=Pose)
+
+    @property
+    def length(self) -> float:
+        """Arc length, m."""
+        return self.outer_length + self.inner_length
+
+    def backbone(self, step: float = STEP) -> np.ndarray:
+        """(N, 3) m, from the closed form of circular arcs."""
+        s = _steps(self.length, step)
+        outer = _arc(np.minimum(s, self.outer_length), self.outer_curvature, self.outer_rotation)
+        # the frame slides along the arc without rolling (Bishop), so it bends about the axis across the bending plane
+        axis = np.array([0.0, -np.sin(self.outer_rotation), np.cos(self.outer_rotation)])
+        joint = Rotation.from_rotvec(axis * self.outer_curvature * self.outer_length).as_matrix()
+        inner = _arc(np.maximum(s - self.outer_length, 0.0), self.inner_curvature, self.inner_rotation)
+        return self.pose.apply(outer + inner @ joint.T)
+
+
+def random_spline(rng: np.random.Generator, length: float, max_curvature: float = MAX_CURVATURE, max_turn: float = np.deg2rad(75)) -> Spline:
+    """A robot-like curve of `length` m at a random pose about the origin; it never bends tighter than `max_curvature` (1/m).
+
+    Its direction strays at most `max_turn` rad from the base's in yaw and in pitch, so it does not curl up.
+    """
+    knots = max(4, int(np.ceil(length / KNOT_SPACING)) + 1)
+    bends = np.cumsum(rng.normal(size=(knots, 2)), axis=0)
+    shape = Spline(length, bends - bends[0])
+    s = np.linspace(0.0, length, 500)
+    angles, rates = shape.angles()(s), shape.angles()(s, 1)
+    curvature = np.hypot(rates[:, 0] * np.cos(angles[:, 1]), rates[:, 1])
+    bound = np.hypot(*rates.T).max()        # of the curvature for any scale below 1 ...
+    scale = min(rng.uniform(0.5, 1.0) * max_curvature / max(bound, curvature.max()), max_turn / np.abs(angles).max())
+    return centred(rng, dataclasses.replace(shape, bends=shape.bends * scale))
+
+
+def random_cannula(rng: np.random.Generator, length: float, max_curvature: float = MAX_CURVATURE) -> Cannula:
+    """A cannula of `length` m at a random pose about the origin, its outer tube straight half of the time."""
+    outer = rng.uniform(0.4, 0.7) * length
+    outer_curvature = rng.choice([0.0, rng.uniform(0.1, 0.4) * max_curvature])
+    return centred(rng, Cannula(outer, float(outer_curvature), rng.uniform(-np.pi, np.pi), length - outer,
+                                rng.uniform(0.3, 0.9) * max_curvature, rng.uniform(-np.pi, np.pi)))
+
+
+def centred(rng: np.random.Generator, shape, spread: float = 0.005):
+    """`shape` in a random attitude, the middle of its bounding box within about `spread` m of the origin."""
+    heading = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+    points = dataclasses.replace(shape, pose=Pose(heading=heading)).backbone(1e-3)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return dataclasses.replace(shape, pose=Pose(rng.normal(0.0, spread, 3) - middle, heading))
+
+
+def moving(shape: Spline | Cannula, t: float, period: float = 8.0) -> Spline | Cannula:
+    """`shape` at `t` s of a slow, periodic motion that never exceeds its own length and curvature: it slides in and out by a fifth and bends.
+
+    A spline follows its own path while it slides and straightens by up to 30 %; a cannula slides and turns its inner tube. At t = 0 it is `shape` itself.
+    """
+    slide = 0.1 * (1 - np.cos(2 * np.pi * t / period))
+    bend = 0.15 * (1 - np.cos(2 * np.pi * t / (0.73 * period)))
+    if isinstance(shape, Cannula):
+        return dataclasses.replace(shape, inner_length=shape.inner_length * (1 - 2 * slide), inner_rotation=shape.inner_rotation + 2 * bend)
+    return dataclasses.replace(shape, length=shape.length * (1 - slide), bends=shape.bends * (1 - bend))
+
+
+def _steps(length: float, step: float) -> np.ndarray:
+    """(N,) arc lengths 0 .. length in equal steps of nearly `step` m."""
+    if not 0 < step <= length:
+        raise ValueError(f'a backbone of {length:g} m can not be cut into steps of {step:g} m')
+    return np.linspace(0.0, length, round(length / step) + 1)
+
+
+def _arc(s: np.ndarray, curvature: float, rotation: float) -> np.ndarray:
+    """(N, 3) points at arc lengths `s` of a circular arc from the origin along +x, bending in the plane at `rotation` about x."""
+    half = curvature * s / 2
+    forward = s * np.sinc(2 * half / np.pi)                             # sin(ks) / k
+    aside = s * np.sin(half) * np.sinc(half / np.pi)                    # (1 - cos(ks)) / k
+    return np.c_[forward, aside * np.cos(rotation), aside * np.sin(rotation)]
