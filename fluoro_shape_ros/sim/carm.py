@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..data import View
-from ..geometry import make_view
+from ..geometry import decompose, depth, make_view, project
 
 
 @dataclass(frozen=True)
@@ -45,3 +45,21 @@ def view(name: str, primary: float, secondary: float = 0.0, arm: CArm = CArm()) 
 def biplane(angle_a: tuple[float, float] = (0.0, 0.0), angle_b: tuple[float, float] = (np.pi / 2, 0.0), arm: CArm = CArm()) -> tuple[View, View]:
     """Views of planes A and B at (primary, secondary) angles in rad."""
     return view('a', *angle_a, arm), view('b', *angle_b, arm)
+
+
+def finest_pitch(view: View, backbone: np.ndarray) -> float:
+    """m a pixel, across the ray, where (N, 3) points come nearest to the source. Raises ValueError where they reach it."""
+    nearest = depth(view.P, backbone).min()
+    if nearest <= 0:
+        raise ValueError(f'plane {view.name}: the device reaches the X-ray source')
+    K, _, _ = decompose(view.P)
+    return float(nearest / max(abs(K[0, 0]), abs(K[1, 1])))
+
+
+def shadow_box(view: View, backbone: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """First and past-the-last pixel (u, v) of the rectangle that holds the shadow of a tube of `radius` m; None where the image misses it."""
+    uv = project(view.P, backbone)
+    reach = radius / finest_pitch(view, backbone) + 2
+    low = np.maximum(np.floor(uv.min(axis=0) - reach), 0).astype(int)
+    high = np.minimum(np.ceil(uv.max(axis=0) + reach) + 1, [view.width, view.height]).astype(int)
+    return None if (low >= high).any() else (low, high)

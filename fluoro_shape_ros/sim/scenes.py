@@ -117,7 +117,8 @@ def xray_run(seed: int, *, arm: carm.CArm = carm.CArm(), angle_a=(0.0, 0.0), ang
             second = shapes.random_spline(np.random.default_rng([seed, 4]), 0.4, max_curvature=8.0).backbone()
             beam = beam * xray.transmission(second, 0.6 * radius, view, xray.Exposure(contrast=0.6 * exposure.contrast))
         if 'occluder' in clutter and i == 1:
-            beam = beam * surroundings.occluder(rng, size, np.median(project(view.P, shape.backbone()), axis=0))
+            points = shape.backbone()
+            beam = beam * surroundings.occluder(rng, size, project(view.P, points[len(points) // 2]))
         beams.append(beam)
     return Run('_'.join(['xray', kind, *clutter]), seed, fields, shape, shaft, radius, 'xray', exposure, tuple(beams), 'text' in clutter)
 

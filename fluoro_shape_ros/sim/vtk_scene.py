@@ -13,12 +13,12 @@ import numpy as np
 
 from ..data import View
 from ..geometry import decompose
+from .carm import shadow_box
 
 SIDES = 32          # of the tube: its mean width is 0.3 % below the circle's
 SUPERSAMPLING = 4   # VTK's edges are hard: so many samples a pixel and axis make them area fractions ...
 # ... taken once for each of these shifts (u, v in samples), so that an edge along an axis is met at 16 places a pixel, not at 4
 SHIFTS = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
-MARGIN_PX = 2
 
 
 def render(backbone: np.ndarray, radius: float, view: View, device: float = 0.12, background: float = 0.75) -> np.ndarray:
@@ -38,27 +38,20 @@ def degrade(image: np.ndarray, rng: np.random.Generator, variance: float = 0.002
 
 def coverage(backbone: np.ndarray, radius: float, view: View) -> np.ndarray:
     """(H, W) float32: the fraction of each pixel that the tube's shadow covers. Only the device's surroundings are rendered."""
-    K, R, t = decompose(view.P)
-    points = backbone @ R.T + t             # camera frame: z along the beam
     image = np.zeros((view.height, view.width), np.float32)
-    if points[:, 2].min() <= radius:
-        raise ValueError(f'plane {view.name}: the device reaches the X-ray source')
-    uv = points @ K.T
-    uv = uv[:, :2] / uv[:, 2:]
-    reach = radius * max(abs(K[0, 0]), abs(K[1, 1])) / points[:, 2].min() + MARGIN_PX
-    low = np.maximum(np.floor(uv.min(axis=0) - reach), 0).astype(int)
-    high = np.minimum(np.ceil(uv.max(axis=0) + reach) + 1, [view.width, view.height]).astype(int)
-    if (low >= high).any():
+    box = shadow_box(view, backbone, radius)
+    if box is None:
         return image
+    low, high = box
+    K, R, t = decompose(view.P)
     crop = np.array([[1.0, 0.0, -low[0]], [0.0, 1.0, -low[1]], [0.0, 0.0, 1.0]]) @ K
-    size = high - low
-    drawn = _draw(points, radius, crop, size)
-    image[low[1]:high[1], low[0]:high[0]] = cv2.resize(drawn, tuple(int(n) for n in size), interpolation=cv2.INTER_AREA)
+    drawn = _draw(backbone @ R.T + t, radius, crop, high - low)
+    image[low[1]:high[1], low[0]:high[0]] = cv2.resize(drawn, tuple(int(n) for n in high - low), interpolation=cv2.INTER_AREA)
     return image
 
 
 def _draw(points: np.ndarray, radius: float, K: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(h, w) float32 in [0, 1]: the tube about (N, 3) camera-frame points, in SUPERSAMPLING times `size` (w, h) px of intrinsics K."""
+    """(h, w) float32 in [0, 1]: the tube about (N, 3) points of the camera's frame (z along the beam), in SUPERSAMPLING times `size` (w, h) px of intrinsics K."""
     try:
         import vtkmodules.vtkRenderingOpenGL2   # noqa: F401, before anything is made: it brings the classes that draw
         from vtkmodules.util.numpy_support import vtk_to_numpy

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 
 from ..data import View
-from ..geometry import decompose, project, source
+from ..geometry import depth, project, source
+from .carm import finest_pitch, shadow_box
 
 SUPERSAMPLING = 3
-GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+CHORD_CUTS = 4
 
 
 @dataclass(frozen=True)
@@ -42,22 +43,19 @@ def path_length(backbone: np.ndarray, radius: float, view: View) -> np.ndarray:
 
     A volume dV at depth z spreads over the image as L du dv = dV f^2 / (z^2 cos(alpha)), alpha the ray's angle to the axis.
     """
-    points, volumes = _samples(backbone, radius, _finest_pitch(backbone, view) / SUPERSAMPLING)
-    ray = points - source(view.P)
-    z = ray @ view.P[2, :3]
-    if z.min() <= 0:
-        raise ValueError(f'plane {view.name}: the device reaches the X-ray source')
-    f2 = abs(np.linalg.det(view.P[:, :3]))      # det K, since K[2, 2] = 1 and P is normalised
-    weights = volumes * f2 * np.linalg.norm(ray, axis=1) / z**3
     image = np.zeros((view.height, view.width), np.float32)
-    uv = project(view.P, points)
-    low = np.maximum(np.floor(uv.min(axis=0) - 1), 0).astype(int)
-    high = np.minimum(np.ceil(uv.max(axis=0) + 2), [view.width, view.height]).astype(int)
-    if (low >= high).any():
+    box = shadow_box(view, backbone, radius)
+    if box is None:
         return image
-    size = high - low
-    fine = _splat((uv - low + 0.5) * SUPERSAMPLING - 0.5, weights, size * SUPERSAMPLING) * SUPERSAMPLING**2
-    image[low[1]:high[1], low[0]:high[0]] = cv2.resize(fine, tuple(int(n) for n in size), interpolation=cv2.INTER_AREA)
+    low, high = box
+    eye = source(view.P)
+    points, volumes = _samples(backbone, radius, eye, finest_pitch(view, backbone) / SUPERSAMPLING)
+    f2 = abs(np.linalg.det(view.P[:, :3]))      # det K, since K[2, 2] = 1 and P is normalised
+    ray = points - eye
+    weights = volumes * f2 * np.sqrt(np.einsum('ni,ni->n', ray, ray)) / depth(view.P, points)**3
+    uv = (project(view.P, points) - low + 0.5) * SUPERSAMPLING - 0.5
+    fine = _splat(uv, weights * SUPERSAMPLING**2, (high - low) * SUPERSAMPLING)
+    image[low[1]:high[1], low[0]:high[0]] = cv2.resize(fine, tuple(int(n) for n in high - low), interpolation=cv2.INTER_AREA)
     return image
 
 
@@ -85,48 +83,44 @@ def _quantum_noise(beam: np.ndarray, photons: float, rng: np.random.Generator) -
     return noisy / np.float32(photons)
 
 
-def _finest_pitch(backbone: np.ndarray, view: View) -> float:
-    """m a pixel at the device's point nearest to the source, across the ray."""
-    K, _, _ = decompose(view.P)
-    return float((backbone @ view.P[2, :3] + view.P[2, 3]).min() / max(abs(K[0, 0]), abs(K[1, 1])))
-
-
-def _samples(backbone: np.ndarray, radius: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+def _samples(backbone: np.ndarray, radius: float, eye: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
     """(M, 3) points in m that fill the tube, and (M,) their volumes in m^3.
 
-    Discs a `pitch` apart, each a sunflower turned against the one before, so that seen from anywhere the samples stand in no rows.
+    Discs a `pitch` apart are cut into chords along the ray from `eye`, a `pitch` apart too, and each chord into CHORD_CUTS pieces.
     """
     s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(backbone, axis=0), axis=1)))
     n = max(2, int(np.ceil(s[-1] / pitch)))
-    middle = (np.arange(n) + 0.5) * s[-1] / n
     tangents = np.gradient(backbone, s, axis=0)
     curvatures = np.gradient(tangents, s, axis=0)
+    middle = (np.arange(n) + 0.5) * s[-1] / n
     centre, tangent, bend = (np.stack([np.interp(middle, s, c) for c in x.T], axis=1) for x in (backbone, tangents, curvatures))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    across = np.eye(3)[np.abs(tangent).argmin(axis=1)]
-    e1 = np.cross(tangent, across)
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    e2 = np.cross(tangent, e1)
-    m = int(np.clip(8 * radius / pitch, 24, 256))
-    k = np.arange(m)
-    angle = GOLDEN_ANGLE * k + np.arange(n)[:, None] * 2.0     # 2 rad is no fraction of a turn
-    r = radius * np.sqrt((k + 0.5) / m)
-    offsets = (r * np.cos(angle))[..., None] * e1[:, None] + (r * np.sin(angle))[..., None] * e2[:, None]
+    never_along = 1e-6 * np.eye(3)[np.abs(tangent).argmin(axis=1)]     # keeps `across` defined where the device points at the source
+    across = np.cross(centre - eye + never_along, tangent)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    depthwise = np.cross(tangent, across)
+    m = max(8, int(np.ceil(2 * radius / pitch)))
+    a = radius * ((np.arange(m) + 0.5) / m * 2 - 1)
+    half_chord = np.sqrt(radius**2 - a**2)
+    b = half_chord[:, None] * ((np.arange(CHORD_CUTS) + 0.5) / CHORD_CUTS * 2 - 1)
+    a, share = (np.repeat(x, CHORD_CUTS) for x in (a, half_chord / half_chord.sum() / CHORD_CUTS))
+    offsets = a[:, None] * across[:, None] + b.reshape(-1, 1) * depthwise[:, None]
     # Pappus: the inside of a bend holds less of the tube than its outside
-    share = 1 - np.einsum('nmi,ni->nm', offsets, bend)
-    volumes = share * (np.pi * radius**2 / m * s[-1] / n)
+    volumes = (1 - np.einsum('nmi,ni->nm', offsets, bend)) * share * (np.pi * radius**2 * s[-1] / n)
     return (centre[:, None] + offsets).reshape(-1, 3), volumes.ravel()
 
 
 def _splat(uv: np.ndarray, weights: np.ndarray, size: np.ndarray) -> np.ndarray:
     """(h, w) float32: weights (M,) summed at (M, 2) pixels, each shared bilinearly among its four; what falls outside is lost."""
     w, h = (int(n) for n in size)
-    low = np.floor(uv).astype(np.int64)
-    du, dv = (uv - low).T
-    u, v = low.T + 1        # a border of one pixel takes what falls outside
+    low = np.floor(uv)
+    u, v = low.T.astype(np.int32) + 1       # a border of one pixel takes what falls outside
     inside = (u >= 0) & (v >= 0) & (u <= w) & (v <= h)
-    at = (v * (w + 2) + u)[inside]
-    fine = np.zeros((h + 2) * (w + 2))
-    for shift, share in ((0, (1 - du) * (1 - dv)), (1, du * (1 - dv)), (w + 2, (1 - du) * dv), (w + 3, du * dv)):
-        fine += np.bincount(at + shift, (share * weights)[inside], fine.size)
+    at = np.where(inside, v * (w + 2) + u, 0)
+    du, dv = (uv - low).T
+    weights = weights * inside
+    right, down = weights * du, weights * dv
+    both = right * dv
+    fine = np.bincount(np.concatenate([at, at + 1, at + w + 2, at + w + 3]),
+                       np.concatenate([weights - right - down + both, right - both, down - both, both]), (h + 2) * (w + 2))
     return fine.reshape(h + 2, w + 2)[1:-1, 1:-1].astype(np.float32)
