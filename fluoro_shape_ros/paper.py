@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from skimage.morphology import thin
@@ -20,6 +21,8 @@ from .ridge import eigenvalues, hessian
 WIENER_PX = 6
 BETA_1 = 2 * 0.8**2
 SCALES = (1.0, 1.5, 2.0)    # open: "several", here in half widths of the device
+STAIRCASE_PX = 5
+END_PX = 5.0
 
 
 def segment(image: np.ndarray, half_width_px: float, min_length_px: float) -> np.ndarray:
@@ -68,7 +71,14 @@ def longest_curve(skeleton: np.ndarray, min_length_px: float) -> np.ndarray:
     path = [int(np.argmax(np.where(np.isinf(d), -1, d)))]
     while path[-1] != start:
         path.append(before[path[-1]])
-    return np.c_[u[path], v[path]].astype(float)
+    return _without_staircase(np.c_[u[path], v[path]].astype(float))
+
+
+def _without_staircase(path_px: np.ndarray) -> np.ndarray:
+    """open: thinning leaves whole pixels; their mean over STAIRCASE_PX of them is taken for the line, the ends stay."""
+    smooth = uniform_filter1d(path_px, STAIRCASE_PX, axis=0, mode='nearest')
+    smooth[[0, -1]] = path_px[[0, -1]]
+    return smooth
 
 
 def _neighbours(u: np.ndarray, v: np.ndarray, shape: tuple[int, int]) -> coo_matrix:
@@ -95,7 +105,8 @@ def correspond(points_px: np.ndarray, curve_px: np.ndarray, F: np.ndarray) -> tu
     """(M,) indices of the points whose epipolar line meets the other image's curve, and (M, 2) where.
 
     points_px: (N, 2), curve_px: (K, 2), both along the device in the same direction; F maps the points' image to the curve's.
-    open: of several intersections the one at the most similar share of the length counts.
+    open: of several intersections the one at the most similar share of the length counts; an end whose line passes the other curve's end
+    within END_PX corresponds to it.
     """
     lines = epipolar_lines(F, points_px)
     distance = lines[:, :2] @ curve_px.T + lines[:, 2:]                 # (N, K) px
@@ -107,7 +118,12 @@ def correspond(points_px: np.ndarray, curve_px: np.ndarray, F: np.ndarray) -> tu
     k = cost[met].argmin(axis=1)
     d0, d1 = distance[met, k], distance[met, k + 1]
     t = np.where(d0 == d1, 0.0, d0 / np.where(d0 == d1, 1.0, d0 - d1))
-    return met, curve_px[k] + t[:, None] * (curve_px[k + 1] - curve_px[k])
+    there = curve_px[k] + t[:, None] * (curve_px[k + 1] - curve_px[k])
+    if 0 not in met and abs(distance[0, 0]) < END_PX:
+        met, there = np.append(0, met), np.vstack([curve_px[:1], there])
+    if len(points_px) - 1 not in met and abs(distance[-1, -1]) < END_PX:
+        met, there = np.append(met, len(points_px) - 1), np.vstack([there, curve_px[-1:]])
+    return met, there
 
 
 def same_direction(a_px: np.ndarray, b_px: np.ndarray, F: np.ndarray) -> bool:
