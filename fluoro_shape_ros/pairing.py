@@ -169,6 +169,11 @@ class CameraBook:
             return None
         return self._cameras[max(bisect_right(self._stamps, stamp_ns) - 1, 0)]
 
+    @property
+    def newest(self):
+        """The last camera, or None."""
+        return self._cameras[-1] if self._cameras else None
+
     def awaits(self, stamp_ns: int) -> bool:
         """Whether an image came before its camera: cameras have been coming with the images, but this one's is still on its way."""
         self._asked = stamp_ns

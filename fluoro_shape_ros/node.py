@@ -1,0 +1,104 @@
+"""The process around the node: arguments, signals, exit codes. ROS is imported only once the arguments are read."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import sys
+import threading
+
+from .config import ConfigError, fields
+from .tools import cli
+
+PROG = 'fluoro_shape_node'
+ROS_PACKAGES = ('rclpy', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_srvs')
+STOP_S = 1.0    # for the pair at work when the node is told to end
+
+
+def main(argv=None) -> int:
+    """Run the node; the exit code: 0 after SIGINT or SIGTERM, 1 without ROS (one line), 2 for unusable arguments (one line)."""
+    # From rclpy.init on its own handlers end the spinning; Python's must not throw into whatever runs just then.
+    told_to_stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: told_to_stop.set())
+    argv = sys.argv[1:] if argv is None else list(argv)
+    return cli.run(lambda _: _run(argv, told_to_stop), _parser(), own_arguments(argv))
+
+
+def own_arguments(argv: list[str]) -> list[str]:
+    """`argv` without what is between --ros-args and -- or the end: that is for ROS."""
+    own, for_ros = [], False
+    for argument in argv:
+        if argument == '--ros-args':
+            for_ros = True
+        elif for_ros and argument == '--':
+            for_ros = False
+        elif not for_ros:
+            own.append(argument)
+    return own
+
+
+def _parser() -> argparse.ArgumentParser:
+    lines = []
+    for f in fields():
+        unit = f', {f.metadata["unit"]}' if f.metadata['unit'] else ''
+        default = list(f.default) if f.metadata['element'] else f.default
+        lines.append(f'  {f.name}: {f.metadata["description"]} (default {default!r}{unit})')
+    return argparse.ArgumentParser(
+        PROG, usage=f'{PROG} [-h] [--ros-args -p PARAMETER:=VALUE ... -r TOPIC:=OTHER ...]', formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Reconstruct backbone and tip of a continuum device from two synchronized fluoroscopy streams.\n\n'
+                    'Listens to plane_a/image_raw, plane_a/camera_info, plane_b/image_raw, plane_b/camera_info, predicted_backbone;\n'
+                    'publishes backbone, tip, /diagnostics; serves ~/reset, ~/enable, ~/capture_mask, ~/clear_mask.',
+        epilog='parameters:\n' + '\n'.join(lines))
+
+
+def _run(argv: list[str], told_to_stop: threading.Event) -> int:
+    for package in ROS_PACKAGES:
+        cli.need(package, 'ros')
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.impl.implementation_singleton import rclpy_implementation
+    from rclpy.qos_overriding_options import InvalidQosOverridesError
+
+    from .ros_node import FluoroShapeNode
+    try:
+        rclpy.init(args=argv)
+        node = FluoroShapeNode()
+    except rclpy_implementation.UnknownROSArgsError as error:
+        return _refuse(f'unknown ROS arguments {error}')
+    except (ConfigError, InvalidQosOverridesError) as error:
+        rclpy.try_shutdown()
+        return _refuse(error)
+    except RuntimeError as error:   # rclpy has no type of its own for arguments that it can't parse
+        rclpy.try_shutdown()
+        message = re.sub(r',? at \S+:\d+', '', str(error))     # without places in ROS's sources
+        if 'parse' not in message:
+            raise cli.ToolError(message) from error
+        return _refuse(message)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if not told_to_stop.is_set():   # it may have come before rclpy's handlers
+            executor.spin()
+    except ExternalShutdownException:
+        pass
+    finally:
+        ended = node.stop(STOP_S)
+        rclpy.try_shutdown()
+        if not ended:   # a thread deep in numpy or OpenCV can't be interrupted, and must not run on while Python is taken down
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
+        node.destroy_node()
+    return 0
+
+
+def _refuse(message) -> int:
+    print(f'{PROG}: {" ".join(str(message).split())}', file=sys.stderr)
+    return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main())

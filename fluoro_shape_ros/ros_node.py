@@ -1,0 +1,272 @@
+"""The ROS side of the house: subscribe, pair, hand over to the worker, publish."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from functools import lru_cache
+
+import cv2
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
+from nav_msgs.msg import Path
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_srvs.srv import SetBool, Trigger
+
+from msg_adapters.cameras import BadCameraInfo
+from msg_adapters.diagnostics import Tally, diagnostic_array, pairing_status, plane_status, reconstruction_status
+from msg_adapters.messages import ros_message, stamp_ns
+from msg_adapters.shapes import BadPath, path_to_points, shape_to_path, shape_to_tip
+
+from . import params
+from .config import Config, ConfigError
+from .data import Frame, Outcome, Reconstruction
+from .pairing import PLANES, CameraBook, Pairer
+from .pipeline import reconstruct
+from .subscriptions import AdaptiveSubscription, transform_lookup
+from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
+
+IMAGE_DEPTH, INFO_DEPTH = 5, 10
+PATIENCE_S = 0.2        # for a camera info that should come with its image
+
+
+class FluoroShapeNode(Node):
+    """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread reconstructs and publishes.
+
+    Raises ConfigError where a parameter given at the start can't work.
+    """
+
+    def __init__(self):
+        super().__init__('fluoro_shape')
+        self._config = params.declare(self)
+        self._enabled, self._prediction, self._held, self._levels = True, None, None, None
+        self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
+        self._tally, self._memory = Tally(), Memory()
+        self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
+
+        overridable = QoSOverridingOptions.with_default_policies()
+        latest = QoSProfile(depth=1)    # reliable
+        self._path_out = self.create_publisher(Path, 'backbone', latest, qos_overriding_options=overridable)
+        self._tip_out = self.create_publisher(PointStamped, 'tip', latest, qos_overriding_options=overridable)
+        self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10), qos_overriding_options=overridable)
+        self._answered = self.create_guard_condition(self._report_changes)
+        self._worker = Worker(self._work, self._failed)
+        self._inputs = {}
+        self._listen()
+        self.create_subscription(Path, 'predicted_backbone', self._on_prediction, QoSProfile(depth=1), qos_overriding_options=overridable)
+        for name, kind, callback in (('reset', Trigger, self._on_reset), ('enable', SetBool, self._on_enable),
+                                     ('capture_mask', Trigger, self._on_capture_mask), ('clear_mask', Trigger, self._on_clear_mask)):
+            self.create_service(kind, f'~/{name}', callback)
+        self.add_pre_set_parameters_callback(params.as_declared)
+        self.add_on_set_parameters_callback(self._on_check_parameters)
+        self.add_post_set_parameters_callback(self._on_parameters)
+        self.create_timer(1.0, self._on_second)
+
+    def stop(self, timeout_s: float) -> bool:
+        """End the worker; whether it got to the end of its pair in time."""
+        return self._worker.stop(timeout_s)
+
+    @property
+    def _slop_ns(self) -> int:
+        return round(self._config.input.sync_slop * 1e9)
+
+    # ---- what comes in
+
+    def _listen(self) -> None:
+        """(Re)make the subscriptions to images and camera infos."""
+        for old in self._inputs.values():
+            old.destroy()
+        given = self._config.input
+        if given.geometry == 'tf' and self._lookup is None:
+            self._lookup = transform_lookup(self)
+        # camera infos first: the executor takes them in this order, and an image needs its camera
+        for plane in PLANES:
+            self._inputs[f'camera info {plane}'] = AdaptiveSubscription(
+                self, CameraInfo, f'plane_{plane}/camera_info', lambda msg, plane=plane: self._on_camera_info(plane, msg), INFO_DEPTH, given.image_reliability)
+        for plane in PLANES:
+            topic, kind = self.resolve_topic_name(f'plane_{plane}/image_raw'), Image
+            if given.image_transport == 'compressed':   # beside the image wherever that was remapped to, as image_transport does it
+                topic, kind = f'{topic}/compressed', CompressedImage
+            self._inputs[f'image {plane}'] = AdaptiveSubscription(
+                self, kind, topic, lambda msg, plane=plane: self._on_image(plane, msg), IMAGE_DEPTH, given.image_reliability)
+
+    def _on_image(self, plane: str, msg) -> None:
+        self._tally.event(f'image {plane}')
+        if not self._enabled:
+            return
+        stamp, arrived, counts = stamp_ns(msg), time.monotonic(), self._pairer.counts
+        jumps, unstamped = counts.jumps, counts.unstamped
+        pair = self._pairer.add(plane, stamp, msg)
+        if counts.unstamped > unstamped:
+            self._tally.event('unstamped')
+        if counts.jumps > jumps:
+            self._tally.event('jump')
+            self.get_logger().warn(f'plane {plane}: stamps jumped back: starting anew')
+            self._forget()
+            for book in self._books.values():
+                book.rewind(stamp)
+        if pair is not None:
+            self._tally.event('pair')
+            self._drop(self._held is not None)
+            self._held = *pair, arrived
+            self._hand_over()
+
+    def _on_camera_info(self, plane: str, msg) -> None:
+        book, known = self._books[plane], camera(msg)
+        try:
+            if known != book.newest:
+                known = checked_camera(msg, self._config)
+        except BadCameraInfo as error:
+            self._tally.refused(f'camera info {plane}', str(error))
+            self._report_changes()
+            return
+        self._tally.accepted(f'camera info {plane}')
+        book.add(stamp_ns(msg), known)
+        self._hand_over()
+
+    def _on_prediction(self, msg: Path) -> None:
+        try:
+            self._prediction = Prediction(path_to_points(msg), msg.header.frame_id)
+            self._tally.accepted('prediction')
+        except BadPath as error:
+            self._prediction = None
+            self._tally.refused('prediction', str(error))
+        self._report_changes()
+
+    def _hand_over(self) -> None:
+        """Give the pair that is held to the worker, as soon as its cameras are known."""
+        if self._held is None:
+            return
+        stamp_a, image_a, image_b, arrived = self._held
+        stamps = stamp_a, stamp_ns(image_b)
+        waits = [self._books[plane].awaits(stamp) for plane, stamp in zip(PLANES, stamps)]
+        if any(waits) and time.monotonic() < arrived + PATIENCE_S:
+            return
+        for plane, late in zip(PLANES, waits):
+            if late:
+                self._books[plane].give_up()
+        self._held = None
+        cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, stamps))
+        self._drop(self._worker.offer(Job(stamp_a, (image_a, image_b), cameras, self._config, self._memory.generation, arrived, self._prediction)))
+
+    def _drop(self, dropped: bool) -> None:
+        if dropped:
+            self._tally.event('dropped')
+
+    def _forget(self) -> None:
+        """Nothing of what came before counts any more, but the cameras and the mask."""
+        self._held = None
+        self._worker.clear()
+        self._memory.reset()
+
+    # ---- services and parameters
+
+    def _on_reset(self, request, response):
+        self._pairer.reset()
+        self._forget()
+        response.success, response.message = True, 'tracking state and buffered frames forgotten'
+        return response
+
+    def _on_enable(self, request, response):
+        self._enabled = request.data
+        self._pairer.reset()
+        self._forget()
+        self._report_changes()
+        response.success, response.message = True, 'processing' if request.data else 'paused'
+        return response
+
+    def _on_capture_mask(self, request, response):
+        pairs = self._config.input.mask_frames
+        self._memory.capture_mask(pairs)
+        response.success, response.message = True, f'the next {pairs} pairs become the mask: keep the device out of the field'
+        return response
+
+    def _on_clear_mask(self, request, response):
+        self._memory.clear_mask()
+        response.success, response.message = True, 'no mask'
+        return response
+
+    def _on_check_parameters(self, parameters) -> SetParametersResult:
+        try:
+            params.changed(self._config, parameters)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_parameters(self, parameters) -> None:
+        old, self._config = self._config, params.changed(self._config, parameters)
+        self._pairer.slop_ns = self._slop_ns
+        subscribed = ('geometry', 'image_transport', 'image_reliability')
+        if any(getattr(old.input, name) != getattr(self._config.input, name) for name in subscribed):
+            self._listen()
+
+    # ---- what goes out
+
+    def _work(self, job: Job) -> None:
+        """A pair from messages to messages, in the worker's thread."""
+        if job.config.input.threads != self._threads:
+            self._threads = job.config.input.threads
+            cv2.setNumThreads(self._threads or -1)      # 0 would mean none for OpenCV
+        frame = adapt(job, self._view_of, self._lookup, self._tally)
+        result = frame if isinstance(frame, Reconstruction) else self._reconstruct(job, frame)
+        if result is not None:
+            self._tally.result(result, time.monotonic() - job.arrived)
+        self._answered.trigger()
+
+    def _reconstruct(self, job: Job, frame: Frame) -> Reconstruction | None:
+        """The published answer to a frame; None where it went into the mask or was overtaken by a reset."""
+        window = image_window(job, frame)
+        if self._memory.take_for_mask(frame, window):
+            return None
+        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window, self._tally))
+        if not self._memory.remember(job, frame, result):
+            return None
+        if result.shape is not None:
+            self._path_out.publish(shape_to_path(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
+            self._tip_out.publish(shape_to_tip(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
+        return result
+
+    def _failed(self, job: Job, error: Exception) -> None:
+        """A bug, in the worker's thread: said once, counted always."""
+        if not self.context.ok():   # what fails while the node goes down is no news
+            return
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        bug = f'{type(error).__name__} in {place.filename}:{place.lineno}'
+        if not self._tally.count(bug):
+            self.get_logger().error(''.join(traceback.format_exception(error)))
+        self._tally.event(bug)
+        self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}'), time.monotonic() - job.arrived)
+        self._answered.trigger()
+
+    def _statuses(self) -> list:
+        gap = self._pairer.gap_ns
+        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None,
+                                    reliability='best_effort' if self._inputs[f'image {plane}'].best_effort else 'reliable',
+                                    fell_back=self._inputs[f'image {plane}'].fell_back) for plane in PLANES]
+        pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)
+        fault = self._tally.reason('prediction')
+        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}')))
+        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes)
+        return [*map(plane_status, planes), pairing_status(pairing), reconstruction_status(results)]
+
+    def _report(self, statuses) -> None:
+        self._levels = _key(statuses)
+        self._diagnostics_out.publish(diagnostic_array(statuses, self.get_clock().now().nanoseconds, self.get_name(), ros_message))
+
+    def _report_changes(self) -> None:
+        statuses = self._statuses()
+        if _key(statuses) != self._levels:
+            self._report(statuses)
+
+    def _on_second(self) -> None:
+        self._hand_over()
+        self._report(self._statuses())
+
+
+def _key(statuses) -> list:
+    """What is worth telling at once."""
+    return [(s.level, s.values.get('last outcome')) for s in statuses]

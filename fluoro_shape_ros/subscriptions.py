@@ -1,0 +1,92 @@
+"""What the node listens to: subscriptions that take what a publisher offers, and poses from tf."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.time import Time
+from scipy.spatial.transform import Rotation
+
+from .worker import Lookup, NoTransform
+
+_OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
+
+
+class AdaptiveSubscription:
+    """A subscription that is reliable, until a publisher offers only best-effort: then it is remade so, by itself.
+
+    With no publisher left it is reliable again. `image_reliability` other than auto, or a QoS override of the reliability, fixes it.
+    """
+
+    def __init__(self, node: Node, msg_type, topic: str, callback: Callable, depth: int, image_reliability: str):
+        self._node, self._depth, self._auto = node, depth, image_reliability == 'auto'
+        self._msg_type, self._topic, self._callback = msg_type, topic, callback
+        self._subscription = None
+        wanted = QoSReliabilityPolicy.BEST_EFFORT if image_reliability == 'best_effort' else QoSReliabilityPolicy.RELIABLE
+        self._make(wanted, (*_OVERRIDABLE, QoSPolicyKind.RELIABILITY))
+        self._auto = self._auto and not self.best_effort    # not where an override says best-effort
+
+    @property
+    def best_effort(self) -> bool:
+        """Whether best-effort is in use."""
+        return self._subscription.qos_profile.reliability == QoSReliabilityPolicy.BEST_EFFORT
+
+    @property
+    def fell_back(self) -> bool:
+        """Whether best-effort is in use because of a publisher, not because anybody wanted it."""
+        return self._auto and self.best_effort
+
+    def destroy(self) -> None:
+        self._node.destroy_subscription(self._subscription)
+
+    def _make(self, reliability: QoSReliabilityPolicy, overridable) -> None:
+        if self._subscription is not None:
+            self.destroy()
+        events = SubscriptionEventCallbacks(incompatible_qos=self._incompatible, matched=self._matched)
+        self._subscription = self._node.create_subscription(
+            self._msg_type, self._topic, self._callback, QoSProfile(depth=self._depth, reliability=reliability),
+            event_callbacks=events, qos_overriding_options=QoSOverridingOptions(overridable))
+
+    def _incompatible(self, event) -> None:
+        topic = self._subscription.topic_name
+        if event.last_policy_kind != QoSPolicyKind.RELIABILITY or not self._auto:
+            self._node.get_logger().warn(f'{topic}: a publisher offers an incompatible {QoSPolicyKind(event.last_policy_kind).name.lower()}: it is not heard')
+        elif not self.best_effort:
+            self._node.get_logger().warn(f'{topic}: a publisher offers only best-effort: taking that, images may get lost')
+            self._make(QoSReliabilityPolicy.BEST_EFFORT, _OVERRIDABLE)
+
+    def _matched(self, event) -> None:
+        if self.fell_back and event.current_count == 0 and event.current_count_change < 0:
+            self._make(QoSReliabilityPolicy.RELIABLE, _OVERRIDABLE)
+
+
+def transform_lookup(node: Node) -> Lookup:
+    """A function (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples, from tf2.
+
+    It raises NoTransform, also where tf2_ros is not installed.
+    """
+    try:
+        import tf2_ros
+    except ImportError as error:
+        missing = f'geometry:=tf needs tf2_ros, which is not installed here ({error})'
+
+        def unknown(reference: str, camera: str, stamp_ns: int):
+            raise NoTransform(missing)
+        return unknown
+    buffer = tf2_ros.Buffer()
+    buffer.listener = tf2_ros.TransformListener(buffer, node)   # lives as long as the buffer
+
+    def lookup(reference: str, camera: str, stamp_ns: int):
+        try:
+            t = buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns)).transform
+        except tf2_ros.TransformException as error:
+            raise NoTransform(f'{camera} from {reference}: {error}') from error
+        q, p = t.rotation, t.translation
+        R = Rotation.from_quat(np.array([q.x, q.y, q.z, q.w])).as_matrix()
+        return tuple(map(tuple, R.tolist())), (p.x, p.y, p.z)
+    return lookup

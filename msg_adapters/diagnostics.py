@@ -1,0 +1,231 @@
+"""How the node is doing: counts, their summary in words, and diagnostic_msgs/DiagnosticArray.
+
+`Tally` counts; the `*_status` functions judge a summary; `diagnostic_array` makes the message.
+"""
+
+from __future__ import annotations
+
+import statistics
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+from fluoro_shape_ros.data import Outcome, Reconstruction
+from fluoro_shape_ros.pairing import Counts
+
+from .messages import New, header
+
+OK, WARN, ERROR, STALE = range(4)   # diagnostic_msgs/DiagnosticStatus
+WINDOW_S = 3.0      # over which rates and latencies are taken, and after which a silent stream is stale
+# what no better image would mend: something is not connected or configured as it must be
+FAULTS = {Outcome.BAD_IMAGE, Outcome.BAD_CAMERA_INFO, Outcome.NO_CAMERA_INFO, Outcome.NO_TRANSFORM, Outcome.BAD_GEOMETRY, Outcome.INTERNAL_ERROR}
+
+
+@dataclass(frozen=True)
+class Status:
+    """One line of diagnostics."""
+
+    name: str
+    level: int
+    message: str                # the reason first
+    values: dict[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PlaneSummary:
+    plane: str                      # 'a' or 'b'
+    images: int = 0
+    rate_hz: float = 0.0
+    silent_s: float | None = None   # since the last image; None: there was none yet
+    bad_images: int = 0
+    image_fault: str = ''           # why the last image was refused; empty: it was not
+    has_camera: bool = False
+    bad_camera_infos: int = 0
+    camera_fault: str = ''          # the same for the last camera info
+    reliability: str = 'reliable'   # in use
+    fell_back: bool = False         # best-effort only because that is all a publisher offers
+
+
+@dataclass(frozen=True)
+class PairingSummary:
+    counts: Counts
+    slop_s: float
+    rate_hz: float = 0.0
+    dropped: int = 0                # complete pairs overtaken by a newer one before their turn
+    silent_s: float | None = None   # since the last pair; None: there was none yet
+    gap_s: float | None = None      # newest stamp of plane B less that of plane A
+    both_alive: bool = False        # images come in both planes
+    unstamped: bool = False         # images without a stamp came lately
+    jumped: bool = False            # stamps jumped back lately
+
+
+@dataclass(frozen=True)
+class ReconstructionSummary:
+    enabled: bool = True
+    mask: str = 'none'
+    capturing: bool = False
+    outcome: Outcome | None = None  # of the last pair; None: there was none yet
+    detail: str = ''
+    warnings: tuple[str, ...] = ()  # of the last pair
+    notes: tuple[str, ...] = ()     # what else went wrong lately
+    silent_s: float | None = None   # since the last pair
+    rate_hz: float = 0.0            # of results
+    latency_s: tuple[float, ...] = ()       # of the last results: second image's arrival to publication
+    outcomes: dict[str, int] = field(default_factory=dict)
+
+
+def plane_status(s: PlaneSummary) -> Status:
+    """What is to be said of one plane's images and camera."""
+    if s.image_fault:
+        level, message = ERROR, f'bad image: {s.image_fault}'
+    elif s.camera_fault:
+        level, message = (WARN, f'camera info refused, the one before holds: {s.camera_fault}') if s.has_camera else (ERROR, f'camera info refused: {s.camera_fault}')
+    elif s.silent_s is None:
+        level, message = STALE, 'no image yet'
+    elif s.silent_s > WINDOW_S:
+        level, message = STALE, f'no image for {s.silent_s:.0f} s'
+    elif not s.has_camera:
+        level, message = ERROR, 'no camera info yet'
+    elif s.fell_back:
+        level, message = WARN, 'best-effort is all the publisher offers: images may get lost'
+    else:
+        level, message = OK, f'{s.rate_hz:.1f} images/s'
+    return Status(f'plane {s.plane}', level, message, {
+        'images': s.images, 'rate (1/s)': f'{s.rate_hz:.1f}', 'bad images': s.bad_images, 'bad camera infos': s.bad_camera_infos,
+        'camera info': 'known' if s.has_camera else 'none', 'reliability': s.reliability})
+
+
+def pairing_status(s: PairingSummary) -> Status:
+    """What is to be said of the pairing of the two streams."""
+    c = s.counts
+    quiet = s.silent_s is None or s.silent_s > WINDOW_S
+    if s.unstamped:
+        level, message = ERROR, 'images without a stamp (zero) can\'t be paired'
+    elif s.jumped:
+        level, message = WARN, 'stamps jumped back: everything before was forgotten'
+    elif quiet and s.both_alive and s.gap_s is not None:
+        level, message = WARN, f'nothing pairs: the newest stamps differ by {abs(s.gap_s) * 1e3:.1f} ms, sync_slop is {s.slop_s * 1e3:.1f} ms'
+    elif quiet:
+        level, message = STALE, 'no pair yet' if s.silent_s is None else f'no pair for {s.silent_s:.0f} s'
+    else:
+        level, message = OK, f'{s.rate_hz:.1f} pairs/s'
+    return Status('pairing', level, message, {
+        'pairs': c.pairs, 'rate (1/s)': f'{s.rate_hz:.1f}', 'dropped': s.dropped, 'unpaired': c.unpaired, 'out of order': c.out_of_order,
+        'duplicates': c.duplicates, 'unstamped': c.unstamped, 'jumps back': c.jumps})
+
+
+def reconstruction_status(s: ReconstructionSummary) -> Status:
+    """What is to be said of the results."""
+    last = 'none' if s.outcome is None else s.outcome.value
+    reason = last if s.detail in ('', last) else f'{last}: {s.detail}'
+    notes = (*s.warnings, *s.notes)
+    if not s.enabled:
+        level, message = WARN, 'paused by ~/enable'
+    elif s.capturing:
+        level, message = OK, f'mask: {s.mask}'
+    elif s.outcome is None:
+        level, message = (WARN, '; '.join(s.notes)) if s.notes else (STALE, 'no pair yet')
+    elif s.silent_s > WINDOW_S:
+        level, message = STALE, f'no pair for {s.silent_s:.0f} s; the last one: {reason}'
+    elif s.outcome is not Outcome.OK:
+        level, message = ERROR if s.outcome in FAULTS else WARN, '; '.join((reason, *s.notes))
+    elif notes:
+        level, message = WARN, '; '.join(notes)
+    else:
+        level, message = OK, f'{s.rate_hz:.1f} results/s'
+    ms = [1e3 * x for x in s.latency_s]
+    values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask,
+              'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
+    return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
+
+
+def diagnostic_array(statuses: list[Status], stamp_ns: int, node_name: str, new: New):
+    """A diagnostic_msgs/DiagnosticArray; `new` is a factory (see messages)."""
+    return new('diagnostic_msgs/msg/DiagnosticArray', header=header(new, stamp_ns, ''), status=[
+        new('diagnostic_msgs/msg/DiagnosticStatus', level=s.level, name=f'{node_name}: {s.name}', message=s.message, hardware_id=node_name,
+            values=[new('diagnostic_msgs/msg/KeyValue', key=k, value=str(v)) for k, v in s.values.items()])
+        for s in statuses])
+
+
+class Tally:
+    """Counts what happens; may be asked and told from any thread."""
+
+    def __init__(self, clock=time.monotonic):
+        self._clock, self._lock = clock, threading.Lock()
+        self._start = clock()
+        self._counts = Counter()
+        self._events = {}       # name -> times (and values) of the last WINDOW_S
+        self._last = {}         # name -> time of the last one
+        self._reasons = {}      # name -> why the last one was refused
+        self._result = None
+
+    def event(self, name: str, value: float = 0.0) -> None:
+        """Something happened, with a number that may belong to it."""
+        with self._lock:
+            now = self._clock()
+            self._counts[name] += 1
+            self._last[name] = now
+            self._recent(name, now).append((now, value))
+
+    def refused(self, name: str, reason: str) -> None:
+        """Something was refused; it counts as `bad {name}`."""
+        self.event(f'bad {name}')
+        with self._lock:
+            self._reasons[name] = reason
+
+    def accepted(self, name: str) -> None:
+        """The last one of `name` was not refused."""
+        with self._lock:
+            self._reasons.pop(name, None)
+
+    def result(self, result: Reconstruction, latency_s: float) -> None:
+        """A pair came to an end."""
+        self.event(f'outcome {result.outcome.value}', latency_s)
+        self.event('answer')
+        self._result = result
+
+    def reason(self, name: str) -> str:
+        """Why the last one of `name` was refused; empty where it was not."""
+        return self._reasons.get(name, '')
+
+    def count(self, name: str) -> int:
+        return self._counts[name]
+
+    def rate_hz(self, name: str) -> float:
+        with self._lock:
+            now = self._clock()
+            return len(self._recent(name, now)) / max(min(WINDOW_S, now - self._start), 1.0)
+
+    def silent_s(self, name: str) -> float | None:
+        """Time since the last event, None where there was none."""
+        with self._lock:
+            return self._clock() - self._last[name] if name in self._last else None
+
+    def lately(self, name: str) -> bool:
+        with self._lock:
+            return bool(self._recent(name, self._clock()))
+
+    def plane(self, plane: str, **known) -> PlaneSummary:
+        """The summary of a plane; `known` are the fields that nobody counts."""
+        image, camera = f'image {plane}', f'camera info {plane}'
+        return PlaneSummary(plane, self.count(image), self.rate_hz(image), self.silent_s(image), self.count(f'bad {image}'), self.reason(image),
+                            bad_camera_infos=self.count(f'bad {camera}'), camera_fault=self.reason(camera), **known)
+
+    def pairing(self, counts: Counts, **known) -> PairingSummary:
+        return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), silent_s=self.silent_s('pair'),
+                              both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'), jumped=self.lately('jump'), **known)
+
+    def reconstruction(self, **known) -> ReconstructionSummary:
+        done, good = self._result, f'outcome {Outcome.OK.value}'
+        with self._lock:
+            latency = tuple(value for _, value in self._recent(good, self._clock()))
+            outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
+        seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings)
+        return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes, **seen, **known)
+
+    def _recent(self, name: str, now: float) -> deque:
+        events = self._events.setdefault(name, deque(maxlen=1000))
+        while events and events[0][0] < now - WINDOW_S:
+            events.popleft()
+        return events
