@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..data import Frame
+from ..data import Frame, View
 from ..geometry import project
 from . import anatomy as surroundings
 from . import carm, placement, shapes, vtk_scene, xray
@@ -17,6 +19,8 @@ RADIUS = 0.0006                     # m
 CLUTTER = ('leads', 'wire', 'blades', 'field', 'occluder', 'text')
 RENDERERS = ('vtk', 'xray')
 DEVICE, BACKGROUND = 0.12, 0.75     # grey levels of protocol P
+BIPLANE = carm.biplane()
+PROTOCOL_P = carm.biplane(arm=carm.CArm(pixel_size_iso=0.523e-3))
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,7 @@ class Run:
         return surroundings.burn_in(image) if self.text else image
 
 
-def grey(backbone: np.ndarray, radius: float, view, renderer: str) -> np.ndarray:
+def grey(backbone: np.ndarray, radius: float, view: View, renderer: str) -> np.ndarray:
     """(H, W) float32: a device of grey level DEVICE on BACKGROUND, noise-free, by either renderer.
 
     The X-ray one is as dark where the beam crosses the device's axis, and brighter towards its edges.
@@ -78,13 +82,18 @@ def grey(backbone: np.ndarray, radius: float, view, renderer: str) -> np.ndarray
     return np.float32(BACKGROUND) * xray.transmission(backbone, radius, view, xray.Exposure(contrast=1 - DEVICE / BACKGROUND))
 
 
-def protocol_p_run(seed: int, renderer: str = 'vtk', kind: str = 'spline', entering: bool = False, angle: float = np.pi / 2) -> Run:
-    """The simulation of Burgner et al. 2011: 1024x1024, 0.523 mm a pixel at the isocentre, planes `angle` rad apart (there 90 degrees)."""
+def protocol_p_run(seed: int, renderer: str = 'vtk', *, views=PROTOCOL_P, kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS,
+                   entering: bool = False) -> Run:
+    """The simulation of Burgner et al. 2011: a device of grey level DEVICE on BACKGROUND, 5x5 Gaussian blur, white noise of variance 0.002.
+
+    There `views` are 1024x1024 px of 0.523 mm and 90 degrees apart. `kind` is spline or cannula, lengths are (shortest, longest) in m;
+    `entering` puts the base outside both fields. Raises ValueError for what does not exist or does not fit.
+    """
     if renderer not in RENDERERS:
         raise ValueError(f'no renderer is called {renderer!r}: there are {", ".join(RENDERERS)}')
-    fields = tuple(placement.Field(v) for v in carm.biplane(angle_b=(angle, 0.0), arm=carm.CArm(pixel_size_iso=0.523e-3)))
-    shape, shaft = placement.place(np.random.default_rng([seed, 0]), fields, kind, LENGTHS, entering)
-    return Run(f'p_{renderer}_{kind}', seed, fields, shape, shaft, RADIUS, renderer)
+    fields = tuple(placement.Field(v) for v in views)
+    shape, shaft = placement.place(np.random.default_rng([seed, 0]), fields, kind, lengths, entering)
+    return Run(f'p_{renderer}_{kind}', seed, fields, shape, shaft, radius, renderer)
 
 
 def protocol_p(seed: int, renderer: str = 'vtk', **options) -> Scene:
@@ -92,22 +101,21 @@ def protocol_p(seed: int, renderer: str = 'vtk', **options) -> Scene:
     return protocol_p_run(seed, renderer, **options).scene()
 
 
-def xray_run(seed: int, *, arm: carm.CArm = carm.CArm(), angle_a=(0.0, 0.0), angle_b=(np.pi / 2, 0.0), exposure: xray.Exposure = xray.Exposure(),
-             anatomy: bool = True, clutter: tuple[str, ...] = (), kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS, entering: bool = False) -> Run:
+def xray_run(seed: int, *, views=BIPLANE, exposure: xray.Exposure = xray.Exposure(), anatomy: bool = True, clutter: tuple[str, ...] = (),
+             kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS, entering: bool = False) -> Run:
     """A run that looks like fluoroscopy: a metal device in front of an anatomy-like background and any of CLUTTER.
 
-    Angles are (primary, secondary) in rad, lengths (shortest, longest) in m. An occluder hides a part of the device in plane B only.
+    An occluder hides a part of the device in plane B only; a wire is a second, weaker device. The other options are those of `protocol_p_run`.
     """
     if unknown := set(clutter) - set(CLUTTER):
         raise ValueError(f'no clutter is called {", ".join(sorted(unknown))}: there are {", ".join(CLUTTER)}')
-    views = carm.biplane(angle_a, angle_b, arm)
-    size = (arm.height, arm.width)
-    apertures = [_aperture(np.random.default_rng([seed, 2, i]), size, clutter) for i in (0, 1)]
+    apertures = [_aperture(np.random.default_rng([seed, 2, i]), view, clutter) for i, view in enumerate(views)]
     fields = tuple(placement.lit_field(v, a) for v, a in zip(views, apertures))
     shape, shaft = placement.place(np.random.default_rng([seed, 0]), fields, kind, lengths, entering)
+    points = shape.backbone()
     beams = []
     for i, (view, aperture) in enumerate(zip(views, apertures)):
-        rng = np.random.default_rng([seed, 3, i])
+        rng, size = np.random.default_rng([seed, 3, i]), (view.height, view.width)
         beam = np.ones(size, np.float32) if aperture is None else aperture
         if anatomy:
             beam = beam * surroundings.anatomy(rng, size)
@@ -117,20 +125,38 @@ def xray_run(seed: int, *, arm: carm.CArm = carm.CArm(), angle_a=(0.0, 0.0), ang
             second = shapes.random_spline(np.random.default_rng([seed, 4]), 0.4, max_curvature=8.0).backbone()
             beam = beam * xray.transmission(second, 0.6 * radius, view, xray.Exposure(contrast=0.6 * exposure.contrast))
         if 'occluder' in clutter and i == 1:
-            points = shape.backbone()
             beam = beam * surroundings.occluder(rng, size, project(view.P, points[len(points) // 2]))
         beams.append(beam)
     return Run('_'.join(['xray', kind, *clutter]), seed, fields, shape, shaft, radius, 'xray', exposure, tuple(beams), 'text' in clutter)
 
 
-def xray_scene(seed: int, *, pixel_size_iso: float = 0.3e-3, photons: float = 1500.0, contrast: float = 0.25, depth: int = 8,
-               angle: float = np.pi / 2, **options) -> Scene:
-    """A still scene of `xray_run`, planes `angle` rad apart; `options` are those of `xray_run`."""
-    exposure = xray.Exposure(photons=photons, contrast=contrast, depth=depth)
-    return xray_run(seed, arm=carm.CArm(pixel_size_iso=pixel_size_iso), angle_b=(angle, 0.0), exposure=exposure, **options).scene()
+def xray_scene(seed: int, *, pixel_size_iso: float = 0.3e-3, angle: float = np.pi / 2, photons: float = 1500.0, contrast: float = 0.25,
+               depth: int = 8, **options) -> Scene:
+    """A still scene of `xray_run`: planes `angle` rad apart; `options` are those of `xray_run`."""
+    views = carm.biplane(angle_b=(angle, 0.0), arm=carm.CArm(pixel_size_iso=pixel_size_iso))
+    return xray_run(seed, views=views, exposure=xray.Exposure(photons=photons, contrast=contrast, depth=depth), **options).scene()
 
 
-def _aperture(rng: np.random.Generator, size: tuple[int, int], clutter: tuple[str, ...]) -> np.ndarray | None:
-    """What collimator blades and the intensifier's circle let through; None where there are neither."""
-    parts = [make(rng, size) for name, make in (('blades', surroundings.blades), ('field', surroundings.intensifier)) if name in clutter]
+def still(run: Run, count: int | None = None) -> Iterator[Scene]:
+    """`count` scenes (None: without end) of a device at rest, each with noise of its own."""
+    return (run.scene(index=k) for k in _first(count))
+
+
+def moving(run: Run, rate: float, count: int | None = None) -> Iterator[Scene]:
+    """`count` scenes (None: without end) of a moving device, `rate` a second."""
+    return (run.scene(k / rate, k) for k in _first(count))
+
+
+def ping_pong(pairs: Sequence[Scene]) -> Iterator[Scene]:
+    """The scenes forth and back without end, so that motion never jumps."""
+    return itertools.cycle([*pairs, *pairs[-2:0:-1]])
+
+
+def _first(count: int | None) -> Iterable[int]:
+    return itertools.count() if count is None else range(count)
+
+
+def _aperture(rng: np.random.Generator, view: View, clutter: tuple[str, ...]) -> np.ndarray | None:
+    """(H, W) float32: what collimator blades and the intensifier's circle let through; None where there are neither."""
+    parts = [make(rng, (view.height, view.width)) for name, make in (('blades', surroundings.blades), ('field', surroundings.intensifier)) if name in clutter]
     return np.prod(parts, axis=0) if parts else None

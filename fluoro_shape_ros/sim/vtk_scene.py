@@ -21,10 +21,14 @@ SUPERSAMPLING = 4   # VTK's edges are hard: so many samples a pixel and axis mak
 SHIFTS = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
 
 
+class NoOpenGL(OSError):
+    """VTK is there, but nothing that it could draw with."""
+
+
 def render(backbone: np.ndarray, radius: float, view: View, device: float = 0.12, background: float = 0.75) -> np.ndarray:
     """(H, W) float32 noise-free grey image in [0, 1] of a tube of `radius` m, as VTK draws it.
 
-    Raises ImportError where VTK is missing and RuntimeError where it finds no OpenGL.
+    Raises ImportError where VTK is missing and NoOpenGL where it can't draw.
     """
     return background + np.float32(device - background) * coverage(backbone, radius, view)
 
@@ -132,7 +136,7 @@ def _aim(camera, clip: np.ndarray) -> None:
 
 
 def _offscreen_window():
-    """A window that needs no display: EGL where there is none. Raises RuntimeError where OpenGL is missing altogether."""
+    """A window that needs no display: EGL where there is none. Raises NoOpenGL where OpenGL is missing altogether."""
     from vtkmodules import vtkRenderingOpenGL2
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
     headless = sys.platform.startswith('linux') and not os.environ.get('DISPLAY')
@@ -140,5 +144,5 @@ def _offscreen_window():
     window = vtkRenderingOpenGL2.vtkEGLRenderWindow() if headless and hasattr(vtkRenderingOpenGL2, 'vtkEGLRenderWindow') else vtkRenderWindow()
     window.SetOffScreenRendering(True)
     if not window.SupportsOpenGL():
-        raise RuntimeError('the VTK renderer finds no OpenGL: it needs a display, or libEGL with a (software) driver')
+        raise NoOpenGL('the VTK renderer finds no OpenGL: it needs a display, or libEGL with a (software) driver')
     return window
