@@ -54,19 +54,25 @@ class BagReader:
         return sum(c.msgcount for c in self._reader.connections if c.topic in topics)
 
     def messages(self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[Recorded]:
-        """The messages on `topics` in the order of their log times, from `start_ns` to before `stop_ns`. Raises BadBag where the file is damaged."""
+        """The messages on `topics` in the order of their log times, from `start_ns` to before `stop_ns`.
+
+        Raises BadBag where the file is damaged, also where fewer messages come than it has by its own account.
+        """
         connections = [c for c in self._reader.connections if c.topic in topics]
         if not connections:     # rosbags would take none for all
             return
-        stream = self._reader.messages(connections, start_ns, stop_ns)
+        stream, missing = self._reader.messages(connections, start_ns, stop_ns), self.count(topics)
         while True:
             with _naming(self._path):
                 entry = next(stream, None)
                 if entry is None:
-                    return
+                    break
                 connection, log_ns, raw = entry
                 recorded = Recorded(connection.topic, log_ns, self._reader.deserialize(raw, connection.msgtype))
+            missing -= 1
             yield recorded
+        if missing and start_ns is None and stop_ns is None:
+            raise BadBag(f'{self._path}: {missing} of {self.count(topics)} messages are not there')
 
 
 @contextmanager

@@ -1,0 +1,188 @@
+"""Bags there and back in both storages, and what is wrong with damaged ones."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rosbags')
+
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from msg_adapters.bags import BadBag, absolute, create_bag, open_bag
+from msg_adapters.images import array_to_image, image_to_array
+from msg_adapters.messages import bag_message, stamp_ns
+
+# of the Jazzy release, as `ros2 topic info -v` prints them
+RIHS01 = {'sensor_msgs/msg/Image': 'RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47',
+          'sensor_msgs/msg/CameraInfo': 'RIHS01_b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275'}
+TOPIC = '/plane_a/image_raw'
+PIXELS = np.random.default_rng(1).integers(0, 2**16, (40, 50), np.uint16)
+
+
+def write(path, storage=None, stamps=(10, 20, 30)):
+    with create_bag(path, storage) as bag:
+        bag.declare(TOPIC, 'sensor_msgs/msg/Image')
+        bag.declare('/plane_a/camera_info', 'sensor_msgs/msg/CameraInfo')
+        for stamp in stamps:
+            bag.write(TOPIC, array_to_image(PIXELS, stamp, 'f', bag.new), stamp + 1)
+    return path
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_there_and_back(tmp_path, storage):
+    with open_bag(write(tmp_path / 'run', storage)) as bag:
+        assert bag.types() == {TOPIC: 'sensor_msgs/msg/Image', '/plane_a/camera_info': 'sensor_msgs/msg/CameraInfo'}
+        assert (bag.count([TOPIC]), bag.count([TOPIC, '/plane_a/camera_info']), bag.start_ns) == (3, 3, 11)
+        got = list(bag.messages([TOPIC, '/nothing']))
+    assert [(r.topic, r.log_ns, stamp_ns(r.message)) for r in got] == [(TOPIC, 11, 10), (TOPIC, 21, 20), (TOPIC, 31, 30)]
+    assert np.array_equal(image_to_array(got[0].message), PIXELS)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_span(tmp_path, storage):
+    with open_bag(write(tmp_path / 'run', storage)) as bag:
+        assert [r.log_ns for r in bag.messages([TOPIC], 12, 31)] == [21]
+        assert [r.log_ns for r in bag.messages([TOPIC], 21)] == [21, 31]
+        assert list(bag.messages(['/nothing'])) == []
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_bag_without_messages(tmp_path, storage):
+    with open_bag(write(tmp_path / 'run', storage, stamps=())) as bag:
+        assert TOPIC in bag.types()
+        assert list(bag.messages([TOPIC])) == []
+
+
+@pytest.mark.parametrize('name, storage, file', [('run', None, 'run.mcap'), ('run.db3', None, 'run.db3.db3'), ('run.db3', 'mcap', 'run.db3.mcap')])
+def test_the_suffix_or_the_option_picks_the_storage(tmp_path, name, storage, file):
+    assert (write(tmp_path / name, storage) / file).exists()
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_types_are_those_of_jazzy(tmp_path, storage):
+    text = (write(tmp_path / 'run', storage) / 'metadata.yaml').read_text()
+    assert all(hash in text for hash in RIHS01.values())
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_the_same_content_gives_the_same_bytes(tmp_path, storage):
+    first, second = (write(tmp_path / folder / 'run', storage) for folder in 'ab')
+    assert {f.name: f.read_bytes() for f in first.iterdir()} == {f.name: f.read_bytes() for f in second.iterdir()}
+
+
+@pytest.mark.parametrize('plugin, mode', [(StoragePlugin.SQLITE3, CompressionMode.FILE), (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+                                          (StoragePlugin.MCAP, CompressionMode.STORAGE), (StoragePlugin.MCAP, CompressionMode.FILE)])
+def test_compressed_bags(tmp_path, plugin, mode):
+    types = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(tmp_path / 'run', version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection(TOPIC, 'sensor_msgs/msg/Image', typestore=types)
+        writer.write(connection, 11, types.serialize_cdr(array_to_image(PIXELS, 10, 'f', bag_message(types)), connection.msgtype))
+    with open_bag(tmp_path / 'run') as bag:
+        assert [np.array_equal(image_to_array(r.message), PIXELS) for r in bag.messages([TOPIC])] == [True]
+
+
+def test_a_single_file_of_a_bag_will_do(tmp_path):
+    with open_bag(write(tmp_path / 'run') / 'run.mcap') as bag:
+        assert bag.count([TOPIC]) == 3
+
+
+def test_a_copied_message_stays_the_same(tmp_path):
+    with open_bag(write(tmp_path / 'run')) as bag, create_bag(tmp_path / 'copy') as out:
+        out.declare(TOPIC, 'sensor_msgs/msg/Image')
+        for r in bag.messages([TOPIC]):
+            out.write(TOPIC, r.message, r.log_ns)
+    with open_bag(tmp_path / 'copy') as bag:
+        assert [(r.log_ns, np.array_equal(image_to_array(r.message), PIXELS)) for r in bag.messages([TOPIC])] == [(11, True), (21, True), (31, True)]
+
+
+def test_nothing_is_overwritten(tmp_path):
+    (tmp_path / 'run').mkdir()
+    with pytest.raises(BadBag, match='run exists already'):
+        write(tmp_path / 'run')
+    assert (tmp_path / 'run').exists()
+
+
+def test_nothing_stays_of_a_bag_that_ends_in_an_error(tmp_path):
+    with pytest.raises(RuntimeError, match='midway'), create_bag(tmp_path / 'run') as bag:
+        bag.declare(TOPIC, 'sensor_msgs/msg/Image')
+        raise RuntimeError('midway')
+    assert not (tmp_path / 'run').exists()
+
+
+def read_all(path):
+    with open_bag(path) as bag:
+        return [image_to_array(r.message) for r in bag.messages([TOPIC])]
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('kept', [0.0, 0.01, 0.5])
+def test_a_truncated_bag_is_named(tmp_path, storage, kept):
+    path = write(tmp_path / 'run', storage)
+    file = next(p for p in path.iterdir() if p.suffix != '.yaml')
+    data = file.read_bytes()
+    file.write_bytes(data[:int(kept * len(data))])
+    with pytest.raises(BadBag, match='run: can\'t be read as a bag') as error:
+        read_all(path)
+    assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('kept', [0.7, 0.9, 0.98])
+def test_no_message_is_lost_silently(tmp_path, kept):
+    """sqlite3 opens a truncated file and tells only when it needs what is missing."""
+    path = write(tmp_path / 'run', 'sqlite3', stamps=range(10, 60))
+    file = path / 'run.db3'
+    file.write_bytes(file.read_bytes()[:int(kept * file.stat().st_size)])
+    try:
+        assert len(read_all(path)) == 50
+    except BadBag:
+        pass
+
+
+def test_fewer_messages_than_announced_are_an_error(tmp_path):
+    path = write(tmp_path / 'run')
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 3', 'message_count: 5'))
+    with pytest.raises(BadBag, match='2 of 5 messages are not there'):
+        read_all(path)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_bag_with_garbage_in_it_never_ends_in_another_error(tmp_path, storage):
+    path = write(tmp_path / 'run', storage)
+    file = next(p for p in path.iterdir() if p.suffix != '.yaml')
+    data, rng, named = file.read_bytes(), np.random.default_rng(2), 0
+    for _ in range(40):
+        broken = bytearray(data)
+        start = rng.integers(len(data) - 64)
+        broken[start:start + 64] = rng.bytes(64)
+        file.write_bytes(broken)
+        try:
+            read_all(path)      # pixels may change unseen
+        except ValueError:      # BadBag or BadImage
+            named += 1
+    assert named
+
+
+@pytest.mark.parametrize('make, says', [
+    (lambda p: None, 'no such bag'),
+    (lambda p: p.mkdir(), 'can\'t be read'),
+    (lambda p: p.write_text('hello'), 'can\'t be read'),
+    (lambda p: (p.mkdir(), (p / 'metadata.yaml').write_text('hello')), 'can\'t be read'),
+    (lambda p: (p.mkdir(), (p / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  version: 99')), 'can\'t be read'),
+], ids=['missing', 'empty folder', 'text file', 'no metadata', 'from the future'])
+def test_what_is_no_bag_is_named(tmp_path, make, says):
+    make(tmp_path / 'run')
+    with pytest.raises(BadBag, match=f'run: .*{says}'), open_bag(tmp_path / 'run'):
+        pass
+
+
+def test_a_bag_of_ros_1_is_named(tmp_path):
+    (tmp_path / 'run.bag').write_bytes(b'#ROSBAG V2.0\n')
+    with pytest.raises(BadBag, match='ROS 1'), open_bag(tmp_path / 'run.bag'):
+        pass
+
+
+def test_relative_topics():
+    assert absolute('plane_a/image_raw') == absolute('/plane_a/image_raw') == '/plane_a/image_raw'
