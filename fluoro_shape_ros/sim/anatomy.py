@@ -112,14 +112,13 @@ def occluder(rng: np.random.Generator, shape: tuple[int, int], centre_px: np.nda
 
 
 def burn_in(image: np.ndarray, lines: tuple[str, ...] = ('FLUORO 15 P/S', '78 KV  4.1 MA', 'SIM')) -> np.ndarray:
-    """A copy of an image with lines of text at its upper left border, in full white."""
+    """(H, W) uint8 or uint16: the image with lines of text at its upper left border, in full white."""
     scale = image.shape[1] / 1024
-    white = float(np.iinfo(image.dtype).max)
-    image = image.copy()
+    text = np.zeros(image.shape, np.uint8)
     for k, line in enumerate(lines):
         at = (round(6 * scale), round((14 + 14 * k) * scale))
-        cv2.putText(image, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * scale, white, max(1, round(scale)))
-    return image
+        cv2.putText(text, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * scale, 255, max(1, round(scale)))
+    return np.maximum(image, text.astype(image.dtype) * (np.iinfo(image.dtype).max // 255))
 
 
 def _half(shape: tuple[int, int]) -> tuple[int, int]:

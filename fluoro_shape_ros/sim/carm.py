@@ -26,6 +26,12 @@ class CArm:
     width: int = 1024                   # px
     height: int = 1024                  # px
 
+    def __post_init__(self):
+        if not 0 < self.sod < self.sid:
+            raise ValueError(f'no C-arm: the isocentre must lie between source and detector, but sod is {self.sod:g} m and sid {self.sid:g} m')
+        if not self.pixel_size_iso > 0 or min(self.width, self.height) < 1:
+            raise ValueError(f'no detector: {self.width}x{self.height} px of {self.pixel_size_iso:g} m')
+
     @property
     def pixel_size(self) -> float:
         """Pixel size at the detector, m."""

@@ -90,10 +90,8 @@ def random_spline(rng: np.random.Generator, length: float, max_curvature: float 
     bends = np.cumsum(rng.normal(size=(knots, 2)), axis=0)
     shape = Spline(length, bends - bends[0])
     s = np.linspace(0.0, length, 500)
-    angles, rates = shape.angles()(s), shape.angles()(s, 1)
-    curvature = np.hypot(rates[:, 0] * np.cos(angles[:, 1]), rates[:, 1])
-    bound = np.hypot(*rates.T).max()        # of the curvature for any scale below 1 ...
-    scale = min(rng.uniform(0.5, 1.0) * max_curvature / max(bound, curvature.max()), max_turn / np.abs(angles).max())
+    tightest = np.hypot(*shape.angles()(s, 1).T).max()      # a bound of the curvature, which is less where the curve is pitched
+    scale = min(rng.uniform(0.5, 1.0) * max_curvature / tightest, max_turn / np.abs(shape.angles()(s)).max())
     return centred(rng, dataclasses.replace(shape, bends=shape.bends * scale))
 
 

@@ -146,7 +146,7 @@ def _publish(sim, run: scenes.Run, args) -> int:
     print(f'publishing {run.name} (seed {args.seed}) at {args.rate:g} pairs/s, ground truth in frame {args.reference_frame}', flush=True)
     start = time.monotonic()
     sim.stream(pairs, args.rate)
-    print(f'published {sim.published} pairs, {sim.published / (time.monotonic() - start):.1f} a second', flush=True)
+    print(f'published {sim.published} pairs in {time.monotonic() - start:.1f} s', flush=True)
     return 0
 
 
