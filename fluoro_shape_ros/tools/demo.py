@@ -1,0 +1,156 @@
+"""fluoro_shape_demo: a simulated biplane system and the node, two processes on real topics, and how well the one sees the other."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ..config import fields
+from . import cli, pictures
+from .score import Score, live_line, summary
+
+FRAME = 'isocenter'
+STARTUP_S = 60.0        # for the simulator to render and everybody to find each other
+SNAPSHOT_S = 5.0        # to catch one answered pair with its images at the end
+STOP_S = 5.0            # for a child to end by itself
+
+
+def main(argv=None) -> int:
+    """The command line; Ctrl-C ends it early, with the summary."""
+    return cli.run(_run, _parser(), argv)
+
+
+def _parser() -> argparse.ArgumentParser:
+    method = next(f for f in fields() if f.name == 'method')
+    parser = argparse.ArgumentParser(
+        'fluoro_shape_demo', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description='Watch a moving continuum device being reconstructed from two simulated X-ray streams, live on ROS 2 topics: starts '
+                    'fluoro_shape_sim and fluoro_shape_node, compares results with ground truth, ends with a summary and pictures.')
+    add = parser.add_argument
+    add('--seconds', type=_positive, default=20.0, metavar='S', help='how long')
+    add('--rate', type=_positive, default=5.0, metavar='HZ', help='pairs a second')
+    add('--seed', type=int, default=5, help='another seed is another device')
+    add('--method', choices=method.metadata['choices'], default=method.default, help='parameter of the node')
+    add('--renderer', choices=('vtk', 'xray'), default='vtk', help='tube, blur and white noise as Burgner et al. 2011 have it, or X-rays through anatomy')
+    add('--out', type=Path, default=Path('fluoro_shape_demo'), metavar='FOLDER', help='pictures and logs go there')
+    add('--domain', type=int, default=47, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f'{text} is not above zero')
+    return value
+
+
+def _run(args) -> int:
+    for module, extra in (('rclpy', 'ros'), ('nav_msgs', 'ros'), ('matplotlib', 'plot')):
+        cli.need(module, extra)
+    args.out.mkdir(parents=True, exist_ok=True)
+    os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
+    from ..sim.publisher import use_large_image_profile
+    from .watcher import Watcher
+    use_large_image_profile()
+    told = _told_to_stop()
+    with contextlib.ExitStack() as stack:
+        children = {name: stack.enter_context(child(arguments, args.out / f'{name}.log')) for name, arguments in commands(args).items()}
+        watcher = stack.enter_context(Watcher())
+
+        def spin(until: Callable[[], bool], seconds: float) -> None:
+            deadline = time.monotonic() + seconds
+            while time.monotonic() < deadline and not until():
+                watcher.spin(0.05)
+                _check(children, args.out)
+
+        print('fluoro_shape_demo: rendering and connecting ...', flush=True)
+        spin(lambda: told.is_set() or watcher.score.start_ns is not None, STARTUP_S)
+        if watcher.score.start_ns is None and not told.is_set():
+            raise cli.ToolError(f'no image came within {STARTUP_S:.0f} s, see {args.out / "sim.log"}')
+        end = time.monotonic() + args.seconds
+        while time.monotonic() < end and not told.is_set():
+            spin(told.is_set, min(1.0, end - time.monotonic()))
+            print(live_line(watcher.score, time.time_ns(), watcher.reason), flush=True)
+        now_ns, measured, watcher.score = time.time_ns(), watcher.score, Score()
+        if measured.answers:
+            watcher.watch_images()
+            spin(lambda: watcher.snapshot is not None, SNAPSHOT_S)
+    return _report(args, watcher, measured, now_ns)
+
+
+def commands(args) -> dict[str, list[str]]:
+    """The arguments of Python for each child."""
+    # an active cannula whose shaft comes in through the border, so that the free end is known to be the tip; 0.3 mm a pixel at the isocentre
+    device = ['--shape', 'cannula', '--length', '0.14', '0.188', '--moving', '--entering', '--pixel-size', '0.00044']
+    sim = ['--seed', str(args.seed), '--rate', str(args.rate), '--renderer', args.renderer, '--wait', str(STARTUP_S)]
+    return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}'],
+            'sim': ['-m', 'fluoro_shape_ros.tools.sim', *sim, *device, '--reference-frame', FRAME]}
+
+
+@contextlib.contextmanager
+def child(arguments: list[str], log: Path) -> Iterator[subprocess.Popen]:
+    """A Python process that writes into `log` and is ended when the block is left."""
+    with log.open('w') as output:
+        # in a process group of its own: Ctrl-C in the terminal is for the demo, which still wants a last picture from its children
+        process = subprocess.Popen([sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, process_group=0)
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _told_to_stop() -> threading.Event:
+    """Set by the first Ctrl-C, SIGTERM or hang-up; the second one raises KeyboardInterrupt."""
+    told = threading.Event()
+
+    def handler(*_):
+        if told.is_set():
+            raise KeyboardInterrupt
+        told.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, handler)
+    return told
+
+
+def _check(children: dict[str, subprocess.Popen], out: Path) -> None:
+    """Raises ToolError, with the child's own words, where one has ended."""
+    for name, process in children.items():
+        if process.poll() is not None:
+            log = out / f'{name}.log'
+            words = log.read_text(errors='replace').strip().splitlines()
+            raise cli.ToolError(f'the {name} ended with exit code {process.returncode}, see {log}: {words[-1] if words else "it said nothing"}')
+
+
+def _report(args, watcher, measured: Score, now_ns: int) -> int:
+    lines = summary(measured, now_ns, watcher.not_answered)
+    print('\n' + '\n'.join(lines), flush=True)
+    if not measured.answers:
+        print('no pictures: there was no result', flush=True)
+        return 0
+    start = measured.start_ns
+    history = pictures.History(np.array([a.stamp_ns - start for a in measured.answers]) * 1e-9, np.array([a.errors.mean for a in measured.answers]),
+                               np.array([a.errors.tip for a in measured.answers]), np.array([s - start for s in measured.unanswered(now_ns)]) * 1e-9)
+    caption = f'fluoro_shape_ros, method {args.method}: ' + ', '.join(' '.join(line.split()) for line in (lines[0].split(',')[0], lines[2].split(',')[0], lines[3].split(',')[0]))
+    saved = pictures.save(args.out, watcher.snapshot, history, caption)
+    print(f'pictures    {", ".join(str(path) for path in saved)}', flush=True)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
