@@ -1,0 +1,277 @@
+"""fluoro_shape_replay: a bag of drawn pairs in, results out."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('rosbags')
+pytest.importorskip('yaml')
+
+from drawing import BASE, BLANK, CALIBRATIONS, GOOD, TOLERANCE, curve   # noqa: E402
+from scipy.spatial import cKDTree                                       # noqa: E402
+
+from fluoro_shape_ros.config import Config, ConfigError                 # noqa: E402
+from fluoro_shape_ros.tools import replay                               # noqa: E402
+from fluoro_shape_ros.tools.parameters import read_parameters           # noqa: E402
+from msg_adapters.bags import create_bag, open_bag                      # noqa: E402
+from msg_adapters.calibration import calibration_to_camera_info         # noqa: E402
+from msg_adapters.images import array_to_image                          # noqa: E402
+from msg_adapters.messages import stamp_ns                              # noqa: E402
+from msg_adapters.shapes import path_to_points                          # noqa: E402
+
+SECOND = 10**9
+IMAGE, INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+SKEW = 2_000_000        # of plane B's stamps, ns
+
+
+def record(path, pairs, storage='mcap', *, stamps=None, infos=True, spoil=lambda message: None, compressed=False):
+    """A bag of `pairs` of images, one every 0.1 s from 5 s on, logged 1 ms after their stamps."""
+    stamps = [5 * SECOND + k * SECOND // 10 for k in range(len(pairs))] if stamps is None else stamps
+    suffix, kind = ('/compressed', 'sensor_msgs/msg/CompressedImage') if compressed else ('', IMAGE)
+    with create_bag(path, storage) as bag:
+        for p in 'ab':
+            bag.declare(f'/plane_{p}/image_raw{suffix}', kind)
+            bag.declare(f'/plane_{p}/camera_info', INFO)
+        for k, (stamp, pair) in enumerate(zip(stamps, pairs)):
+            for p, pixels, calibration, skew in zip('ab', pair, CALIBRATIONS, (0, SKEW)):
+                log = 5 * SECOND + k * SECOND // 10 + 1_000_000
+                message = array_to_image(pixels, stamp + skew, f'plane_{p}_optical', bag.new)
+                spoil(message)
+                if compressed:
+                    message = bag.new(kind, header=message.header, format='png', data=cv2.imencode('.png', pixels)[1])
+                if infos:
+                    bag.write(f'/plane_{p}/camera_info', calibration_to_camera_info(calibration, stamp + skew, f'plane_{p}_optical', bag.new), log)
+                bag.write(f'/plane_{p}/image_raw{suffix}', message, log)
+    return path
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """Good, blank, good."""
+    return record(tmp_path_factory.mktemp('recorded') / 'run', [GOOD, BLANK, GOOD])
+
+
+def read(path):
+    with open_bag(path) as bag:
+        return {topic: [(r.log_ns, r.message) for r in bag.messages([topic])] for topic in bag.types()}
+
+
+def outcomes(path):
+    """Outcome of every pair by its stamp, from the diagnostics."""
+    return {stamp_ns(m): {v.key: v.value for v in m.status[0].values}['last outcome'] for _, m in read(path)['/diagnostics']}
+
+
+def main(*arguments):
+    return replay.main([str(a) for a in arguments])
+
+
+def test_results_follow_the_contract(run, tmp_path, capsys):
+    assert main(run, '--out', tmp_path / 'out', '-p', BASE, '-p', 'reference_frame=cell') == 0
+    results, stamps = read(tmp_path / 'out'), [5 * SECOND, 5_200_000_000]
+    for topic in ('/backbone', '/tip', '/tip_pose', '/backbone_points'):
+        assert [(log, stamp_ns(m), m.header.frame_id) for log, m in results[topic]] == [(s, s, 'cell') for s in stamps], topic
+    points = path_to_points(results['/backbone'][0][1])
+    assert cKDTree(curve()).query(points)[0].max() < TOLERANCE
+    tip = results['/tip'][0][1].point
+    assert [tip.x, tip.y, tip.z] == points[-1].tolist()
+    assert np.linalg.norm(points[-1] - curve()[-1]) < TOLERANCE
+    assert outcomes(tmp_path / 'out') == {5 * SECOND: 'ok', 5_100_000_000: 'no_device_in_plane_a', 5_200_000_000: 'ok'}
+    said = capsys.readouterr().out
+    assert '3 pairs of 3 images of plane A and 3 of plane B' in said
+    assert '2  ok' in said and '1  no_device_in_plane_a' in said
+    assert set(results) == {'/backbone', '/tip', '/tip_pose', '/backbone_points', '/diagnostics'}
+
+
+def test_the_reference_frame_is_by_default_that_of_plane_a(run, tmp_path):
+    main(run, '--out', tmp_path / 'out')
+    assert {m.header.frame_id for _, m in read(tmp_path / 'out')['/backbone']} == {'plane_a_optical'}
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_the_same_output_twice(run, tmp_path, storage):
+    for folder in 'ab':
+        assert main(run, '--out', tmp_path / folder / 'out', '--storage', storage, '--with-images') == 0
+    first, second = ({f.name: f.read_bytes() for f in (tmp_path / folder / 'out').iterdir()} for folder in 'ab')
+    assert first == second
+
+
+def test_storages_agree(tmp_path):
+    for storage in ('mcap', 'sqlite3'):
+        record(tmp_path / storage, [GOOD], storage)
+        main(tmp_path / storage, '--out', tmp_path / f'{storage}_out')
+    a, b = (path_to_points(read(tmp_path / f'{storage}_out')['/backbone'][0][1]) for storage in ('mcap', 'sqlite3'))
+    assert np.array_equal(a, b)
+
+
+def test_images_are_copied_on_demand(run, tmp_path):
+    main(run, '--out', tmp_path / 'out', '--with-images')
+    results = read(tmp_path / 'out')
+    assert [(log, stamp_ns(m)) for log, m in results['/plane_b/image_raw']] == [(5 * SECOND + k * SECOND // 10 + SKEW,) * 2 for k in range(3)]
+    assert bytes(results['/plane_a/image_raw'][0][1].data) == GOOD[0].tobytes()
+    assert len(results['/plane_a/camera_info']) == 3
+    # such a bag can be replayed itself
+    assert main(tmp_path / 'out', '--out', tmp_path / 'again') == 0
+    assert outcomes(tmp_path / 'again') == outcomes(tmp_path / 'out')
+
+
+def test_a_part_of_the_bag(run, tmp_path):
+    main(run, '--out', tmp_path / 'out', '--start', 0.05, '--duration', 0.1)
+    assert list(outcomes(tmp_path / 'out')) == [5_100_000_000]
+    main(run, '--out', tmp_path / 'first', '--duration', 0.05)
+    assert list(outcomes(tmp_path / 'first')) == [5 * SECOND]
+
+
+def test_compressed_images(tmp_path):
+    record(tmp_path / 'run', [GOOD], compressed=True)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', 'image_transport=compressed') == 0
+    assert list(outcomes(tmp_path / 'out').values()) == ['ok']
+
+
+def test_other_topics(tmp_path, run):
+    """Planes may be swapped by name: the answer is the same, stamped by the other plane."""
+    names = [f'--{what}-{p}={f"plane_{q}/{topic}"}' for what, topic in (('image', 'image_raw'), ('info', 'camera_info')) for p, q in ('ab', 'ba')]
+    assert main(run, '--out', tmp_path / 'out', '-p', BASE, *names) == 0
+    assert [log for log, _ in read(tmp_path / 'out')['/tip']] == [5 * SECOND + SKEW, 5_200_000_000 + SKEW]
+
+
+def test_a_bad_image_is_named_and_the_next_pair_works(tmp_path):
+    def spoil(message):
+        if message.header.stamp.nanosec == 0:
+            message.encoding = 'bayer_rggb8'
+    record(tmp_path / 'run', [GOOD, GOOD], spoil=spoil)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
+    assert outcomes(tmp_path / 'out') == {5 * SECOND: 'bad_image', 5_100_000_000: 'ok'}
+    status = read(tmp_path / 'out')['/diagnostics'][0][1].status[0]
+    assert 'plane a' in status.message and 'bayer_rggb8' in status.message and status.level == 2
+
+
+def test_no_camera_info(tmp_path):
+    record(tmp_path / 'run', [GOOD], infos=False)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
+    assert list(outcomes(tmp_path / 'out').values()) == ['no_camera_info']
+
+
+def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, capsys):
+    with create_bag(tmp_path / 'run') as bag:
+        for p, pixels, c in zip('ab', GOOD, CALIBRATIONS):
+            bag.declare(f'/plane_{p}/image_raw', IMAGE)
+            bag.declare(f'/plane_{p}/camera_info', INFO)
+            good, bad = (calibration_to_camera_info(c, stamp, 'f', bag.new) for stamp in (SECOND, 2 * SECOND))
+            bad.p = np.zeros(12)
+            for message in (good, bad):
+                bag.write(f'/plane_{p}/camera_info', message, stamp_ns(message))
+            bag.write(f'/plane_{p}/image_raw', array_to_image(pixels, 3 * SECOND, 'f', bag.new), 3 * SECOND)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
+    assert list(outcomes(tmp_path / 'out').values()) == ['ok']
+    assert 'plane b: camera infos refused: ' in (said := capsys.readouterr().out) and 'P is zero' in said
+
+
+def test_a_camera_holds_from_its_stamp_on():
+    known = [(10, 'first'), (20, 'second'), (30, 'third')]
+    assert [replay.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)] == ['first', 'first', 'first', 'second', 'second', 'third', 'third']
+    assert replay.camera_at([], 5) is None
+
+
+def test_a_bag_that_loops(tmp_path, capsys):
+    """Stamps jump back, as when a looping `ros2 bag play` was recorded: the pairs after it count."""
+    stamps = [5 * SECOND, 5_100_000_000, 1 * SECOND, 1_100_000_000]
+    record(tmp_path / 'run', [GOOD] * 4, stamps=stamps)
+    main(tmp_path / 'run', '--out', tmp_path / 'out')
+    assert outcomes(tmp_path / 'out')[1_100_000_000] == 'ok'
+    assert 'stamps jumped back' in capsys.readouterr().out
+
+
+def test_an_error_of_the_program_costs_its_pair_and_the_exit_code(run, tmp_path, monkeypatch, capsys):
+    def broken(frame, config, prior):
+        if frame.stamp_ns == 5_100_000_000:
+            raise ZeroDivisionError('a bug')
+        return intact(frame, config, prior)
+    intact = replay.reconstruct
+    monkeypatch.setattr(replay, 'reconstruct', broken)
+    assert main(run, '--out', tmp_path / 'out') == 1
+    assert outcomes(tmp_path / 'out') == {5 * SECOND: 'ok', 5_100_000_000: 'internal_error', 5_200_000_000: 'ok'}
+    assert 'ZeroDivisionError: a bug (stamp 5.100 s)' in capsys.readouterr().err
+
+
+def test_parameters_from_file_and_command_line(tmp_path):
+    path = tmp_path / 'params.yaml'
+    path.write_text('/**:\n  ros__parameters:\n    use_sim_time: true\n    robot_radius: 1e-3\n    polarity: bright\n'
+                    'fluoro_shape:\n  ros__parameters:\n    polarity: auto\n    expected_length: [0.01, 1]\n    tracking: false\nother:\n  ros__parameters: {x: 1}\n')
+    values = read_parameters(str(path), ['tracking=true', 'spacing_px:=1e1', 'base_position=[1, 2e-1, 3]'])
+    assert values == dict(robot_radius=1e-3, polarity='auto', expected_length=(0.01, 1), tracking=True, spacing_px=10.0, base_position=(1, 0.2, 3))
+    assert Config.from_values(**values).detection.robot_radius == 0.001
+
+
+@pytest.mark.parametrize('text, says', [('', 'not a ROS parameter file'), ('fluoro_shape: 3', 'no ros__parameters'), ('a: [', 'not YAML'),
+                                        ('other:\n  ros__parameters: {}', 'no ros__parameters of fluoro_shape')])
+def test_a_bad_parameter_file_is_named(tmp_path, text, says):
+    (tmp_path / 'params.yaml').write_text(text)
+    with pytest.raises(ConfigError, match=f'params.yaml: {says}'):
+        read_parameters(str(tmp_path / 'params.yaml'))
+
+
+def process(*arguments, code=None):
+    start = ['-m', 'fluoro_shape_ros.tools.replay'] if code is None else ['-c', code]
+    return subprocess.run([sys.executable, *start, *map(str, arguments)], capture_output=True, text=True, timeout=120)
+
+
+def test_as_a_process(run, tmp_path):
+    done = process(run, '--out', tmp_path / 'out.db3', '-p', BASE)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert list(outcomes(tmp_path / 'out.db3').values()) == ['ok', 'no_device_in_plane_a', 'ok']
+    assert (tmp_path / 'out.db3' / 'out.db3.db3').exists()
+
+
+@pytest.mark.parametrize('arguments, code, says', [
+    (['none'], 1, 'none: no such bag'),
+    (['damaged'], 1, 'damaged: can\'t be read as a bag'),
+    (['run', '--image-a', 'elsewhere'], 1, '/elsewhere is not in the bag; name another with --image-a (such topics in it: /plane_a/image_raw, /plane_b/image_raw)'),
+    (['run', '--info-b', 'plane_b/image_raw'], 1, '/plane_b/image_raw is a sensor_msgs/msg/Image; name another with --info-b'),
+    (['run', '-p', 'sync_slop=0.001'], 1, 'no images pair: there are 3 of plane A and 3 of plane B, 0 without a stamp; sync_slop is 1 ms'),
+    (['run', '--params', 'none.yaml'], 1, 'none.yaml'),
+    (['run', '--out', '.'], 1, '. exists already'),
+    (['run', '-p', 'robot_radius=-1'], 2, 'robot_radius: must lie in'),
+    (['run', '-p', 'colour=red'], 2, 'no such parameter: colour'),
+    (['run', '-p', 'robot_radius'], 2, 'needs the form name=value'),
+    (['run', '-p', 'geometry=tf'], 2, 'geometry: '),
+    (['run', '--image-a', 'x', '--image-b', '/x'], 2, 'same topic'),
+    (['run', '--start', '-1'], 2, '--start'),
+    ([], 2, 'required'),
+], ids=lambda value: ' '.join(value) if isinstance(value, list) else '')
+def test_what_can_not_work_is_said_in_one_line(run, tmp_path, monkeypatch, capsys, arguments, code, says):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'run').symlink_to(run)
+    (tmp_path / 'damaged').write_bytes((run / 'run.mcap').read_bytes()[:5000])
+    arguments = arguments if '--out' in arguments else [*arguments, '--out', 'out']
+    try:
+        assert main(*arguments) == code == 1
+    except SystemExit as end:       # of argparse
+        assert end.code == code == 2
+    error = capsys.readouterr().err
+    assert says in error.splitlines()[-1]
+    assert len(error.splitlines()) == 1 or error.startswith('usage: ')
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize('arguments, code', [(['none', '--out', 'out'], 1), (['none'], 2), (['--help'], 0)])
+def test_exit_codes_of_the_process(tmp_path, arguments, code):
+    done = process(*arguments)
+    assert done.returncode == code
+    assert 'Traceback' not in done.stderr
+
+
+def test_without_rosbags_it_names_the_extra(run, tmp_path):
+    code = 'import sys\nsys.modules["rosbags"] = None\nfrom fluoro_shape_ros.tools.replay import main\nsys.exit(main())'
+    done = process(run, '--out', tmp_path / 'out', code=code)
+    assert done.returncode == 1
+    assert 'fluoro_shape_ros[bags]' in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+def test_needs_no_ros(run, tmp_path):
+    code = ('import sys\nfor name in ("rclpy", "sensor_msgs", "nav_msgs", "std_msgs"): sys.modules[name] = None\n'
+            'from fluoro_shape_ros.tools.replay import main\nsys.exit(main())')
+    done = process(run, '--out', tmp_path / 'out', '--duration', '0.05', code=code)
+    assert (done.returncode, done.stderr) == (0, '')
