@@ -49,7 +49,8 @@ def main(argv=None) -> int:
     times.add_argument('--stamps', metavar='FILE', help='text file with the time of each pair in seconds, one a line')
     parser.add_argument('--frame-ids', nargs=2, default=['plane_a_optical', 'plane_b_optical'], metavar=('A', 'B'),
                         help='frame_id of each plane (default: plane_a_optical plane_b_optical)')
-    cv2.setLogLevel(0)      # what it would say of a bad file is ours to say, in one line
+    # what OpenCV (4 or 5) would say of a bad file is ours to say, in one line
+    (cv2.setLogLevel if hasattr(cv2, 'setLogLevel') else cv2.utils.logging.setLogLevel)(0)
     return run(_import, parser, argv)
 
 
