@@ -182,11 +182,13 @@ class FluoroShapeNode(Node):
     def _on_capture_mask(self, request, response):
         pairs = self._config.input.mask_frames
         self._memory.capture_mask(pairs)
+        self._report_changes()
         response.success, response.message = True, f'the next {pairs} pairs become the mask: keep the device out of the field'
         return response
 
     def _on_clear_mask(self, request, response):
         self._memory.clear_mask()
+        self._report_changes()
         response.success, response.message = True, 'no mask'
         return response
 
@@ -269,4 +271,4 @@ class FluoroShapeNode(Node):
 
 def _key(statuses) -> list:
     """What is worth telling at once."""
-    return [(s.level, s.values.get('last outcome')) for s in statuses]
+    return [(s.level, s.values.get('last outcome'), s.values.get('mask')) for s in statuses]
