@@ -48,7 +48,7 @@ def lit_field(view: View, aperture: np.ndarray | None) -> Field:
 def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, lengths: tuple[float, float], entering: bool) -> tuple:
     """A random shape that two fields see well, and the length in m of the straight shaft behind it (0 unless `entering`).
 
-    Draws until the shape stands MARGIN_PX inside both fields, is `well_seen`, and, when `entering`, until its shaft leaves both.
+    Draws until the shape is `well_seen`, stands MARGIN_PX inside both fields wherever it moves, and, when `entering`, until its shaft leaves both.
     Raises ValueError where no such shape turns up.
     """
     if kind not in KINDS:
@@ -56,8 +56,7 @@ def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, leng
     views = tuple(f.view for f in fields)
     for _ in range(ATTEMPTS):
         shape = KINDS[kind](rng, rng.uniform(*lengths))
-        points = shape.backbone(2e-3)
-        if min(f.room(points).min() for f in fields) < MARGIN_PX or not well_seen(points, views):
+        if not well_seen(shape.backbone(2e-3), views) or not _stays_inside(shape, fields):
             continue
         if not entering:
             return shape, 0.0
@@ -95,6 +94,12 @@ def seen_in_both(backbone: np.ndarray, fields: tuple[Field, Field]) -> np.ndarra
     """(N, 3) the end of the backbone from where it stands in both fields for good up to the tip."""
     outside = np.flatnonzero(np.minimum(*(f.room(backbone) for f in fields)) < 0)
     return backbone[outside[-1] + 1:] if len(outside) else backbone
+
+
+def _stays_inside(shape, fields: tuple[Field, Field]) -> bool:
+    """Whether both fields hold the shape with MARGIN_PX to spare at all corners of its motion."""
+    corners = (shapes.posed(shape, slide, bend).backbone(2e-3) for slide in (0, 1) for bend in (0, 1))
+    return all(f.room(points).min() >= MARGIN_PX for points in corners for f in fields)
 
 
 def _shaft_to_border(shape, fields: tuple[Field, Field]) -> float:

@@ -57,17 +57,25 @@ class Run:
     def scene(self, t: float = 0.0, index: int = 0, stamp_ns: int = 0) -> Scene:
         """The pair at `t` s of the motion (0: as drawn); `index` picks the noise."""
         whole = self.backbone(t)
+        truth = placement.seen_in_both(whole, self.fields)
+        return Scene(self._frame(whole, index, stamp_ns), truth, self.radius, truth[0], self.name, self.seed)
+
+    def without_device(self, index: int = 0, stamp_ns: int = 0) -> Frame:
+        """The pair that is taken before the device comes in: the mask of subtraction angiography."""
+        return self._frame(None, index, stamp_ns)
+
+    def _frame(self, whole: np.ndarray | None, index: int, stamp_ns: int) -> Frame:
         rng = np.random.default_rng([self.seed, 1, index])
         images = tuple(self._image(whole, i, rng) for i in (0, 1))
-        truth = placement.seen_in_both(whole, self.fields)
-        views = tuple(f.view for f in self.fields)
-        return Scene(Frame(stamp_ns, FRAME_ID, images, views), truth, self.radius, truth[0], self.name, self.seed)
+        return Frame(stamp_ns, FRAME_ID, images, tuple(f.view for f in self.fields))
 
-    def _image(self, whole: np.ndarray, i: int, rng: np.random.Generator) -> np.ndarray:
+    def _image(self, whole: np.ndarray | None, i: int, rng: np.random.Generator) -> np.ndarray:
         view = self.fields[i].view
+        bare = np.ones((view.height, view.width), np.float32)
         if self.exposure is None:
-            return vtk_scene.degrade(grey(whole, self.radius, view, self.renderer), rng)
-        beam = xray.transmission(whole, self.radius, view, self.exposure)
+            image = bare * np.float32(BACKGROUND) if whole is None else grey(whole, self.radius, view, self.renderer)
+            return vtk_scene.degrade(image, rng)
+        beam = bare if whole is None else xray.transmission(whole, self.radius, view, self.exposure)
         image = xray.expose(beam if self.beams is None else beam * self.beams[i], self.exposure, rng)
         return surroundings.burn_in(image) if self.text else image
 

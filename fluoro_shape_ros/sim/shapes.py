@@ -112,15 +112,20 @@ def centred(rng: np.random.Generator, shape, spread: float = 0.005):
 
 
 def moving(shape: Spline | Cannula, t: float, period: float = 8.0) -> Spline | Cannula:
-    """`shape` at `t` s of a slow, periodic motion that never exceeds its own length and curvature: it slides in and out by a fifth and bends.
+    """`shape` at `t` s of a slow, periodic motion: it slides out and in, and bends. At t = 0 it is `shape` itself."""
+    slide = 0.5 * (1 - np.cos(2 * np.pi * t / period))
+    bend = 0.5 * (1 - np.cos(2 * np.pi * t / (0.73 * period)))
+    return posed(shape, slide, bend)
 
-    A spline follows its own path while it slides and straightens by up to 30 %; a cannula slides and turns its inner tube. At t = 0 it is `shape` itself.
+
+def posed(shape: Spline | Cannula, slide: float, bend: float) -> Spline | Cannula:
+    """`shape` moved by shares of its motion, both in [0, 1]; it never gets longer or bends tighter than at 0, 0.
+
+    A spline slides back along its own path by a fifth and straightens by 30 %; a cannula draws its inner tube in by two fifths and turns it by 0.6 rad.
     """
-    slide = 0.1 * (1 - np.cos(2 * np.pi * t / period))
-    bend = 0.15 * (1 - np.cos(2 * np.pi * t / (0.73 * period)))
     if isinstance(shape, Cannula):
-        return dataclasses.replace(shape, inner_length=shape.inner_length * (1 - 2 * slide), inner_rotation=shape.inner_rotation + 2 * bend)
-    return dataclasses.replace(shape, length=shape.length * (1 - slide), bends=shape.bends * (1 - bend))
+        return dataclasses.replace(shape, inner_length=shape.inner_length * (1 - 0.4 * slide), inner_rotation=shape.inner_rotation + 0.6 * bend)
+    return dataclasses.replace(shape, length=shape.length * (1 - 0.2 * slide), bends=shape.bends * (1 - 0.3 * bend))
 
 
 def _steps(length: float, step: float) -> np.ndarray:
