@@ -168,7 +168,7 @@ def _copy(bag, out, images: dict[str, str], infos: dict[str, str], span: tuple[i
     for topic in (*infos, *images):
         out.declare(topic, bag.types()[topic])
     for topics, limits in ((infos, (None, None)), (images, span)):
-        for recorded in bag.messages(topics, *limits):
+        for recorded in tqdm(bag.messages(topics, *limits), 'copying', unit='message', disable=None):
             out.write(recorded.topic, recorded.message, stamp_ns(recorded.message))
 
 
