@@ -114,6 +114,7 @@ class FluoroShapeNode(Node):
             self._drop(self._held is not None)
             self._held = *pair, arrived
             self._hand_over()
+        self._report_changes()
 
     def _on_camera_info(self, plane: str, msg) -> None:
         book, known = self._books[plane], camera(msg)
