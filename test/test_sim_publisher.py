@@ -197,7 +197,8 @@ def restored_signals(monkeypatch):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_the_tool_publishes_until_told_to_stop(ears, number, tmp_path):
     log = tmp_path / 'log'
-    process = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.tools.sim', *SMALL, '--moving'], stdout=log.open('w'), stderr=subprocess.STDOUT)
+    command = [sys.executable, '-m', 'fluoro_shape_ros.tools.sim', *SMALL, '--moving']
+    process = subprocess.Popen(command, stdout=log.open('w'), stderr=subprocess.STDOUT)
     try:
         assert ears.until(lambda: len(ears.complete()) >= 3), log.read_text()
         process.send_signal(number)

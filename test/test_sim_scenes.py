@@ -197,7 +197,8 @@ def test_text_is_burnt_in_at_the_border(dtype):
 
 
 @pytest.mark.parametrize('size', [(320, 320), (301, 457)])
-@pytest.mark.parametrize('make', [anatomy.anatomy, anatomy.tissue, anatomy.ribs, anatomy.spine, anatomy.vessels, anatomy.leads, anatomy.blades, anatomy.intensifier])
+@pytest.mark.parametrize('make', [anatomy.anatomy, anatomy.tissue, anatomy.ribs, anatomy.spine, anatomy.vessels, anatomy.leads, anatomy.blades,
+                                  anatomy.intensifier])
 def test_anatomy_transmits_a_share_of_the_beam(make, size):
     for seed in range(4):
         beam = make(np.random.default_rng(seed), size)

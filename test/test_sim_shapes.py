@@ -15,7 +15,8 @@ def quarter_circles(outer_rotation, inner_rotation):
     return Cannula(0.03 * QUARTER, 1 / 0.03, outer_rotation, 0.02 * QUARTER, 1 / 0.02, inner_rotation)
 
 
-RANDOM = [make(np.random.default_rng(seed), length) for seed in range(6) for make, length in ((shapes.random_spline, 0.13), (shapes.random_cannula, 0.1))]
+RANDOM = [make(np.random.default_rng(seed), length) for seed in range(6)
+          for make, length in ((shapes.random_spline, 0.13), (shapes.random_cannula, 0.1))]
 
 
 @pytest.mark.parametrize('cannula, tip_mm', [

@@ -166,5 +166,6 @@ def _first(count: int | None) -> Iterable[int]:
 
 def _aperture(rng: np.random.Generator, view: View, clutter: tuple[str, ...]) -> np.ndarray | None:
     """(H, W) float32: what collimator blades and the intensifier's circle let through; None where there are neither."""
-    parts = [make(rng, (view.height, view.width)) for name, make in (('blades', surroundings.blades), ('field', surroundings.intensifier)) if name in clutter]
+    makers = {'blades': surroundings.blades, 'field': surroundings.intensifier}
+    parts = [make(rng, (view.height, view.width)) for name, make in makers.items() if name in clutter]
     return np.prod(parts, axis=0) if parts else None

@@ -121,7 +121,8 @@ def moving(shape: Spline | Cannula, t: float, period: float = 8.0) -> Spline | C
 def posed(shape: Spline | Cannula, slide: float, bend: float) -> Spline | Cannula:
     """`shape` moved by shares of its motion, both in [0, 1]; it never gets longer or bends tighter than at 0, 0.
 
-    A spline slides back along its own path by a fifth and straightens by 30 %; a cannula draws its inner tube in by two fifths and turns it by 0.6 rad.
+    A spline slides back along its own path by a fifth and straightens by 30 %; a cannula draws its inner tube in by two fifths and turns
+    it by 0.6 rad.
     """
     if isinstance(shape, Cannula):
         return dataclasses.replace(shape, inner_length=shape.inner_length * (1 - 0.4 * slide), inner_rotation=shape.inner_rotation + 0.6 * bend)

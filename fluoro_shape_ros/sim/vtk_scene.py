@@ -41,7 +41,7 @@ def degrade(image: np.ndarray, rng: np.random.Generator, variance: float = 0.002
 
 
 def coverage(backbone: np.ndarray, radius: float, view: View) -> np.ndarray:
-    """(H, W) float32: the fraction of each pixel that the tube's shadow covers. Only the device's surroundings are rendered."""
+    """(H, W) float32: the fraction of each pixel that the tube's shadow covers."""
     image = np.zeros((view.height, view.width), np.float32)
     box = shadow_box(view, backbone, radius)
     if box is None:

@@ -63,7 +63,7 @@ _STREAM = (
     ('--rate', 'pairs a second', dict(type=_positive, default=15.0, metavar='HZ')),
     ('--frames', 'end after N pairs (default: never)', dict(type=_count, metavar='N')),
     ('--wait', 'publish only once somebody listens to all images and camera infos; give up after S seconds', dict(type=_positive, metavar='S')),
-    ('--prerender', f'render N pairs first and play them forth and back; 0: render while publishing (default: {STILL_FRAMES}, moving {MOVING_FRAMES})',
+    ('--prerender', f'render N pairs first, play them forth and back; 0: render while publishing (default: {STILL_FRAMES}, moving {MOVING_FRAMES})',
      dict(type=_count, metavar='N')),
     ('--reliability', 'of images and camera infos', dict(choices=('reliable', 'best_effort'), default='reliable')),
     ('--reference-frame', 'frame of the ground truth; give the node\'s reference_frame the same name', dict(default=scenes.FRAME_ID, metavar='NAME')),
@@ -77,7 +77,8 @@ _DEVICE = (
     ('--entering', 'the shaft comes in through the border of both images', dict(action='store_true')),
 )
 _IMAGES = (
-    ('--renderer', 'X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011', dict(choices=scenes.RENDERERS, default='xray')),
+    ('--renderer', 'X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011',
+     dict(choices=scenes.RENDERERS, default='xray')),
     ('--depth', 'bits a pixel; above 8 the images are mono16; xray only', dict(type=int, choices=(8, 10, 12, 14, 16), default=8)),
     ('--photons', 'detected a pixel in the open beam: the fewer, the noisier; xray only', dict(type=_positive, default=1500.0)),
     ('--contrast', 'share of the beam that the device takes away; xray only', dict(type=_positive, default=0.25)),
@@ -85,7 +86,8 @@ _IMAGES = (
     ('--clutter', 'what else is in the field; xray only', dict(nargs='+', choices=scenes.CLUTTER, default=())),
 )
 _GEOMETRY = (
-    ('--angle-a', 'of plane A, degrees, LAO and cranial are positive (default 0 0)', dict(type=float, nargs=2, default=(0.0, 0.0), metavar=('PRIMARY', 'SECONDARY'))),
+    ('--angle-a', 'of plane A, degrees, LAO and cranial are positive (default 0 0)',
+     dict(type=float, nargs=2, default=(0.0, 0.0), metavar=('PRIMARY', 'SECONDARY'))),
     ('--angle-b', 'of plane B, degrees (default 90 0)', dict(type=float, nargs=2, default=(90.0, 0.0), metavar=('PRIMARY', 'SECONDARY'))),
     ('--sid', 'source to detector, m', dict(type=_positive, default=1.195, metavar='M')),
     ('--sod', 'source to isocentre, m', dict(type=_positive, default=0.81, metavar='M')),
