@@ -55,7 +55,10 @@ def coverage(backbone: np.ndarray, radius: float, view: View) -> np.ndarray:
 
 
 def _draw(points: np.ndarray, radius: float, K: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(h, w) float32 in [0, 1]: the tube about (N, 3) points of the camera's frame (z along the beam), in SUPERSAMPLING times `size` (w, h) px of intrinsics K."""
+    """(h, w) float32 in [0, 1]: the tube about (N, 3) points of the camera's frame (z along the beam), seen with intrinsics K.
+
+    `size` is (w, h) in px of K; the image has SUPERSAMPLING times as many.
+    """
     try:
         import vtkmodules.vtkRenderingOpenGL2   # noqa: F401, before anything is made: it brings the classes that draw
         from vtkmodules.util.numpy_support import vtk_to_numpy
