@@ -186,6 +186,14 @@ def test_parameters_take_effect_at_run_time(client):
     assert client.set('backbone_spacing', 0.001).successful and client.set('reference_frame', 'cell').successful
 
 
+def test_reliability_can_be_chosen(client):
+    assert client.set('image_reliability', 'best_effort').successful and client.connected()
+    assert client.value('plane b', 'reliability') == 'best_effort'
+    assert client.good()
+    assert client.set('image_reliability', 'auto').successful and client.connected()
+    assert client.value('plane b', 'reliability') == 'reliable'
+
+
 def test_whole_numbers_and_empty_lists_are_taken(client):
     assert client.set('max_curvature', 5000).successful
     assert client.set('expected_length', [0, 1]).successful
@@ -255,11 +263,13 @@ def log(tmp_path):
     return tmp_path / 'log.txt'
 
 
-def test_images_before_any_camera_info_and_sigint(log):
-    with NodeProcess(log, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+def test_images_before_any_camera_info_a_qos_override_and_sigint(log):
+    override = 'qos_overrides./plane_b/image_raw.subscription.reliability:=best_effort'
+    with NodeProcess(log, override, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected(), node.log
         heard = lambda: any('no_camera_info' in s.message for s in client.statuses)     # noqa: E731
         assert client.insist(heard, infos=[])
+        assert client.value('plane b', 'reliability') == 'best_effort'
         path, _ = client.good()
         assert path.header.frame_id == 'plane_a_optical'
         assert node.end(signal.SIGINT) == 0 and 'Traceback' not in node.log
