@@ -17,11 +17,12 @@ import numpy as np
 
 from ..config import fields
 from . import cli, pictures
-from .score import Score, live_line, summary
+from .score import Score, headline, live_line, summary
 
 FRAME = 'isocenter'
+RENDERED = 20           # pairs, played forth and back
 STARTUP_S = 60.0        # for the simulator to render and everybody to find each other
-SNAPSHOT_S = 5.0        # to catch one answered pair with its images at the end
+SNAPSHOT_S = 10.0       # to catch one answered pair with its images at the end
 STOP_S = 5.0            # for a child to end by itself
 
 
@@ -41,7 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--rate', type=_positive, default=5.0, metavar='HZ', help='pairs a second')
     add('--seed', type=int, default=5, help='another seed is another device')
     add('--method', choices=method.metadata['choices'], default=method.default, help='parameter of the node')
-    add('--renderer', choices=('vtk', 'xray'), default='vtk', help='tube, blur and white noise as Burgner et al. 2011 have it, or X-rays through anatomy')
+    add('--renderer', choices=('xray', 'vtk'), default='xray', help='X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011')
+    add('--anatomy', action='store_true', help='ribs and spine behind the device (xray only); the method `paper` takes them for devices')
     add('--out', type=Path, default=Path('fluoro_shape_demo'), metavar='FOLDER', help='pictures and logs go there')
     add('--domain', type=int, default=47, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     return parser
@@ -57,7 +59,7 @@ def _positive(text: str) -> float:
 def _run(args) -> int:
     for module, extra in (('rclpy', 'ros'), ('nav_msgs', 'ros'), ('matplotlib', 'plot')):
         cli.need(module, extra)
-    args.out.mkdir(parents=True, exist_ok=True)
+    pictures.clear(args.out)
     os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     from ..sim.publisher import use_large_image_profile
     from .watcher import Watcher
@@ -92,7 +94,9 @@ def commands(args) -> dict[str, list[str]]:
     """The arguments of Python for each child."""
     # an active cannula whose shaft comes in through the border, so that the free end is known to be the tip; 0.3 mm a pixel at the isocentre
     device = ['--shape', 'cannula', '--length', '0.14', '0.188', '--moving', '--entering', '--pixel-size', '0.00044']
-    sim = ['--seed', str(args.seed), '--rate', str(args.rate), '--renderer', args.renderer, '--wait', str(STARTUP_S)]
+    sim = ['--seed', str(args.seed), '--rate', str(args.rate), '--renderer', args.renderer, '--prerender', str(RENDERED), '--wait', str(STARTUP_S)]
+    if not args.anatomy:
+        sim.append('--no-anatomy')
     return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}'],
             'sim': ['-m', 'fluoro_shape_ros.tools.sim', *sim, *device, '--reference-frame', FRAME]}
 
@@ -138,16 +142,14 @@ def _check(children: dict[str, subprocess.Popen], out: Path) -> None:
 
 
 def _report(args, watcher, measured: Score, now_ns: int) -> int:
-    lines = summary(measured, now_ns, watcher.not_answered)
-    print('\n' + '\n'.join(lines), flush=True)
+    print('\n' + '\n'.join(summary(measured, now_ns, watcher.not_answered)), flush=True)
     if not measured.answers:
-        print('no pictures: there was no result', flush=True)
+        print('pictures    none without a result', flush=True)
         return 0
-    start = measured.start_ns
-    history = pictures.History(np.array([a.stamp_ns - start for a in measured.answers]) * 1e-9, np.array([a.errors.mean for a in measured.answers]),
-                               np.array([a.errors.tip for a in measured.answers]), np.array([s - start for s in measured.unanswered(now_ns)]) * 1e-9)
-    caption = f'fluoro_shape_ros, method {args.method}: ' + ', '.join(' '.join(line.split()) for line in (lines[0].split(',')[0], lines[2].split(',')[0], lines[3].split(',')[0]))
-    saved = pictures.save(args.out, watcher.snapshot, history, caption)
+    answers, start = measured.answers, measured.start_ns
+    history = pictures.History(t=np.array([a.stamp_ns - start for a in answers]) * 1e-9, mean=np.array([a.errors.mean for a in answers]),
+                               tip=np.array([a.errors.tip for a in answers]), unanswered=np.array([s - start for s in measured.unanswered(now_ns)]) * 1e-9)
+    saved = pictures.save(args.out, watcher.snapshot, history, f'fluoro_shape_ros, method {args.method}: {headline(measured, now_ns)}')
     print(f'pictures    {", ".join(str(path) for path in saved)}', flush=True)
     return 0
 

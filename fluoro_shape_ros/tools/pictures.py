@@ -20,6 +20,7 @@ GROUND, TEXT, GRID = '#12161c', '#d8dee6', '#39424e'
 FOUND, TRUTH, TIP, MISSED = '#2ad4ff', '#ffffff', '#ff5a5f', '#ffb347'
 STYLE = {'figure.facecolor': GROUND, 'savefig.facecolor': GROUND, 'axes.facecolor': GROUND, 'axes.edgecolor': GRID, 'axes.labelcolor': TEXT, 'text.color': TEXT,
          'xtick.color': TEXT, 'ytick.color': TEXT, 'grid.color': GRID, 'grid.linewidth': 0.6, 'legend.facecolor': GROUND, 'legend.edgecolor': GRID}
+NAMES = ('overlay_a', 'overlay_b', 'backbone', 'demo', 'errors')
 MARGIN_PX = 60          # around the backbone in an overlay
 INSET_HALF_PX = 24      # half the side of the magnified region around the tip
 INSET = 0.33            # of an overlay's side
@@ -46,13 +47,19 @@ class History:
     unanswered: np.ndarray  # (M,) s since the start
 
 
+def clear(out: Path) -> None:
+    """Make the folder `out` and remove the pictures of an earlier run, so that nothing old looks new. Raises OSError where it can't be written."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in NAMES:
+        (out / f'{name}.png').unlink(missing_ok=True)
+
+
 def save(out: Path, snapshot: Snapshot | None, history: History, caption: str) -> list[Path]:
-    """Write the PNGs into the folder `out` (made where missing) and return their paths; without a snapshot only the errors over time.
+    """Write PNGs of NAMES into the folder `out` and return their paths; without a snapshot only the errors over time.
 
     Raises ToolError without matplotlib, OSError where `out` can't be written.
     """
     matplotlib, figures = need('matplotlib', 'plot'), need('matplotlib.figure', 'plot')
-    out.mkdir(parents=True, exist_ok=True)
     saved = []
 
     def sheet(name, size, draw):

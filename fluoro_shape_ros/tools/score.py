@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,9 +91,16 @@ def summary(score: Score, now_ns: int, not_answered: dict[str, int]) -> list[str
     return lines
 
 
-def _median(values: Sequence[float]) -> float:
+def headline(score: Score, now_ns: int) -> str:
+    """The summary in one line, of a score with answers."""
+    answers = score.answers
+    return (f'{len(answers)} of {len(answers) + len(score.unanswered(now_ns))} pairs answered, '
+            f'mean error {_mm(a.errors.mean for a in answers)} mm, tip error {_mm(a.errors.tip for a in answers)} mm (medians)')
+
+
+def _median(values: Iterable[float]) -> float:
     return float(np.median(list(values)))
 
 
-def _mm(values: Sequence[float]) -> str:
+def _mm(values: Iterable[float]) -> str:
     return f'{_median(values) * 1e3:.2f}'
