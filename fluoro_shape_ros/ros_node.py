@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
@@ -23,7 +23,7 @@ from msg_adapters.messages import ros_message, stamp_ns
 from msg_adapters.shapes import BadPath, path_to_points, shape_to_path, shape_to_tip
 
 from . import params
-from .config import Config, ConfigError
+from .config import ConfigError
 from .data import Frame, Outcome, Reconstruction
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
@@ -86,13 +86,13 @@ class FluoroShapeNode(Node):
         # camera infos first: the executor takes them in this order, and an image needs its camera
         for plane in PLANES:
             self._inputs[f'camera info {plane}'] = AdaptiveSubscription(
-                self, CameraInfo, f'plane_{plane}/camera_info', lambda msg, plane=plane: self._on_camera_info(plane, msg), INFO_DEPTH, given.image_reliability)
+                self, CameraInfo, f'plane_{plane}/camera_info', partial(self._on_camera_info, plane), INFO_DEPTH, given.image_reliability)
         for plane in PLANES:
             topic, kind = self.resolve_topic_name(f'plane_{plane}/image_raw'), Image
             if given.image_transport == 'compressed':   # beside the image wherever that was remapped to, as image_transport does it
                 topic, kind = f'{topic}/compressed', CompressedImage
             self._inputs[f'image {plane}'] = AdaptiveSubscription(
-                self, kind, topic, lambda msg, plane=plane: self._on_image(plane, msg), IMAGE_DEPTH, given.image_reliability)
+                self, kind, topic, partial(self._on_image, plane), IMAGE_DEPTH, given.image_reliability)
 
     def _on_image(self, plane: str, msg) -> None:
         self._tally.event(f'image {plane}')

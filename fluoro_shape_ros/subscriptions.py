@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 
 from .worker import Lookup, NoTransform
 
+RELIABILITIES = ('auto', 'reliable', 'best_effort')
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
 
 
@@ -24,12 +26,12 @@ class AdaptiveSubscription:
     """
 
     def __init__(self, node: Node, msg_type, topic: str, callback: Callable, depth: int, image_reliability: str):
-        self._node, self._depth, self._auto = node, depth, image_reliability == 'auto'
+        self._node, self._depth = node, depth
         self._msg_type, self._topic, self._callback = msg_type, topic, callback
         self._subscription = None
-        wanted = QoSReliabilityPolicy.BEST_EFFORT if image_reliability == 'best_effort' else QoSReliabilityPolicy.RELIABLE
-        self._make(wanted, (*_OVERRIDABLE, QoSPolicyKind.RELIABILITY))
-        self._auto = self._auto and not self.best_effort    # not where an override says best-effort
+        wanted = _reliability(node, node.resolve_topic_name(topic), image_reliability)
+        self._auto = wanted == 'auto'
+        self._make(QoSReliabilityPolicy.BEST_EFFORT if wanted == 'best_effort' else QoSReliabilityPolicy.RELIABLE)
 
     @property
     def best_effort(self) -> bool:
@@ -44,25 +46,40 @@ class AdaptiveSubscription:
     def destroy(self) -> None:
         self._node.destroy_subscription(self._subscription)
 
-    def _make(self, reliability: QoSReliabilityPolicy, overridable) -> None:
+    def _make(self, reliability: QoSReliabilityPolicy) -> None:
         if self._subscription is not None:
             self.destroy()
         events = SubscriptionEventCallbacks(incompatible_qos=self._incompatible, matched=self._matched)
         self._subscription = self._node.create_subscription(
             self._msg_type, self._topic, self._callback, QoSProfile(depth=self._depth, reliability=reliability),
-            event_callbacks=events, qos_overriding_options=QoSOverridingOptions(overridable))
+            event_callbacks=events, qos_overriding_options=QoSOverridingOptions(_OVERRIDABLE))
 
     def _incompatible(self, event) -> None:
         topic = self._subscription.topic_name
         if event.last_policy_kind != QoSPolicyKind.RELIABILITY or not self._auto:
-            self._node.get_logger().warn(f'{topic}: a publisher offers an incompatible {QoSPolicyKind(event.last_policy_kind).name.lower()}: it is not heard')
+            policy = QoSPolicyKind(event.last_policy_kind).name.lower()
+            self._node.get_logger().warn(f'{topic}: a publisher offers an incompatible {policy}: it is not heard')
         elif not self.best_effort:
             self._node.get_logger().warn(f'{topic}: a publisher offers only best-effort: taking that, images may get lost')
-            self._make(QoSReliabilityPolicy.BEST_EFFORT, _OVERRIDABLE)
+            self._make(QoSReliabilityPolicy.BEST_EFFORT)
 
     def _matched(self, event) -> None:
         if self.fell_back and event.current_count == 0 and event.current_count_change < 0:
-            self._make(QoSReliabilityPolicy.RELIABLE, _OVERRIDABLE)
+            self._make(QoSReliabilityPolicy.RELIABLE)
+
+
+def _reliability(node: Node, topic: str, image_reliability: str) -> str:
+    """What the QoS override of the reliability says, else `image_reliability`.
+
+    rclpy's own overriding would take the default it declared at first for an override when the subscription is remade.
+    """
+    name = f'qos_overrides.{topic}.subscription.reliability'
+    if not node.has_parameter(name):
+        node.declare_parameter(name, 'auto', ParameterDescriptor(description='reliable, best_effort, or auto: as image_reliability says', read_only=True))
+    value = node.get_parameter(name).value
+    if value not in RELIABILITIES:
+        raise InvalidQosOverridesError(f'{name}: must be one of {", ".join(RELIABILITIES)}, got {value!r}')
+    return image_reliability if value == 'auto' else value
 
 
 def transform_lookup(node: Node) -> Lookup:

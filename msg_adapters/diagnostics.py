@@ -80,7 +80,8 @@ def plane_status(s: PlaneSummary) -> Status:
     if s.image_fault:
         level, message = ERROR, f'bad image: {s.image_fault}'
     elif s.camera_fault:
-        level, message = (WARN, f'camera info refused, the one before holds: {s.camera_fault}') if s.has_camera else (ERROR, f'camera info refused: {s.camera_fault}')
+        level, holds = (WARN, ', the one before holds') if s.has_camera else (ERROR, '')
+        message = f'camera info refused{holds}: {s.camera_fault}'
     elif s.silent_s is None:
         level, message = STALE, 'no image yet'
     elif s.silent_s > WINDOW_S:
@@ -209,12 +210,14 @@ class Tally:
     def plane(self, plane: str, **known) -> PlaneSummary:
         """The summary of a plane; `known` are the fields that nobody counts."""
         image, camera = f'image {plane}', f'camera info {plane}'
-        return PlaneSummary(plane, self.count(image), self.rate_hz(image), self.silent_s(image), self.count(f'bad {image}'), self.reason(image),
+        return PlaneSummary(plane, self.count(image), self.rate_hz(image), self.silent_s(image),
+                            bad_images=self.count(f'bad {image}'), image_fault=self.reason(image),
                             bad_camera_infos=self.count(f'bad {camera}'), camera_fault=self.reason(camera), **known)
 
     def pairing(self, counts: Counts, **known) -> PairingSummary:
         return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), silent_s=self.silent_s('pair'),
-                              both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'), jumped=self.lately('jump'), **known)
+                              both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'),
+                              jumped=self.lately('jump'), **known)
 
     def reconstruction(self, **known) -> ReconstructionSummary:
         done, good = self._result, f'outcome {Outcome.OK.value}'
