@@ -19,8 +19,7 @@ EXECUTABLES = {
 WHEELS = '; sys_platform == "linux" and platform_machine == "x86_64"'
 EXTRAS = {
     'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp')],
-    'bags': ['rosbags>=0.10'],
-    'dicom': ['pydicom>=2.4'],
+    'bags': ['rosbags>=0.10', 'pyyaml>=6.0'],
     'vtk': ['vtk>=9.3'],
     'plot': ['matplotlib>=3.6'],
 }

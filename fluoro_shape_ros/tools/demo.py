@@ -83,11 +83,12 @@ def _run(args) -> int:
         while time.monotonic() < end and not told.is_set():
             spin(told.is_set, min(1.0, end - time.monotonic()))
             print(live_line(watcher.score, time.time_ns(), watcher.reason), flush=True)
-        now_ns, measured, watcher.score = time.time_ns(), watcher.score, Score()
+        now_ns, measured, not_answered = time.time_ns(), watcher.score, dict(watcher.not_answered)
+        watcher.score = Score()     # what comes while images are watched too does not count
         if measured.answers:
             watcher.watch_images()
             spin(lambda: watcher.snapshot is not None, SNAPSHOT_S)
-    return _report(args, watcher, measured, now_ns)
+    return _report(args, measured, now_ns, not_answered, watcher.snapshot)
 
 
 def commands(args) -> dict[str, list[str]]:
@@ -141,15 +142,15 @@ def _check(children: dict[str, subprocess.Popen], out: Path) -> None:
             raise cli.ToolError(f'the {name} ended with exit code {process.returncode}, see {log}: {words[-1] if words else "it said nothing"}')
 
 
-def _report(args, watcher, measured: Score, now_ns: int) -> int:
-    print('\n' + '\n'.join(summary(measured, now_ns, watcher.not_answered)), flush=True)
+def _report(args, measured: Score, now_ns: int, not_answered: dict[str, int], snapshot: pictures.Snapshot | None) -> int:
+    print('\n' + '\n'.join(summary(measured, now_ns, not_answered)), flush=True)
     if not measured.answers:
         print('pictures    none without a result', flush=True)
         return 0
     answers, start = measured.answers, measured.start_ns
     history = pictures.History(t=np.array([a.stamp_ns - start for a in answers]) * 1e-9, mean=np.array([a.errors.mean for a in answers]),
                                tip=np.array([a.errors.tip for a in answers]), unanswered=np.array([s - start for s in measured.unanswered(now_ns)]) * 1e-9)
-    saved = pictures.save(args.out, watcher.snapshot, history, f'fluoro_shape_ros, method {args.method}: {headline(measured, now_ns)}')
+    saved = pictures.save(args.out, snapshot, history, f'fluoro_shape_ros, method {args.method}: {headline(measured, now_ns)}')
     print(f'pictures    {", ".join(str(path) for path in saved)}', flush=True)
     return 0
 

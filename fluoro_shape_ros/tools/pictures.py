@@ -140,7 +140,7 @@ def backbone(ax, bar_ax, snapshot: Snapshot) -> None:
     off = cKDTree(at_arc_length(truth, np.arange(0.0, arc_length(truth)[-1], 0.05))).query(found)[0]
     both = np.vstack([found, truth])
     middle, half = (both.max(axis=0) + both.min(axis=0)) / 2, np.ptp(both, axis=0) * 0.55
-    half = np.maximum(half, 0.4 * half.max())   # room for the ticks of a straight device
+    half = np.maximum(half, 0.5 * half.max())   # room for the ticks of a straight device
     low, high = middle - half, middle + half
     for points, colour in ((found, FOUND), (truth, TRUTH)):     # shadows on floor and wall give the eye depth
         ax.plot(points[:, 0], points[:, 1], low[2], color=colour, lw=1, alpha=0.3)
@@ -152,7 +152,7 @@ def backbone(ax, bar_ax, snapshot: Snapshot) -> None:
     ax.plot(*truth.T, '--', color=TRUTH, lw=1.5, label='truth', zorder=10)
     ax.plot(*found[-1:].T, 'o', color=TIP, ms=9, label='tip found', zorder=11)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel='x (mm)', ylabel='y (mm)', zlabel='z (mm)')
-    ax.set_box_aspect(half)
+    ax.set_box_aspect(half, zoom=min(1.0, 0.6 * np.linalg.norm(half) / half[2]))     # a tall box keeps to its axes
     ax.tick_params(labelsize=8)
     ax.patch.set_visible(False)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
@@ -169,7 +169,7 @@ def errors(ax, history: History) -> None:
     if len(history.t) and history.tip.max() > 20 * np.median(history.tip):     # a gross error must not hide the others
         ax.set_yscale('log')
     else:
-        ax.set_ylim(bottom=0)
+        ax.set_ylim(0, 1.25 * history.tip.max(initial=1e-6) * 1e3)     # room for the legend
     if len(history.unanswered):
         ax.plot(history.unanswered, np.zeros(len(history.unanswered)), '|', color=MISSED, ms=14, mew=1.5, label='no answer', clip_on=False,
                 transform=ax.get_xaxis_transform())
