@@ -1,0 +1,116 @@
+"""Which candidate of plane A and which of plane B are the same device, and which of their points correspond.
+
+A local alignment (Smith and Waterman 1981) of the two curves' points: going along both at once, each point that lies on the
+other's epipolar line gains its length, each that does not costs. It is monotone, skips what only one plane sees, leaves the ends free, and
+needs no unique intersection, so tangency to an epipolar line and self-crossings do not break it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .curve import arc_length, at_arc_length
+from .geometry import epipolar_lines
+
+SAMPLES = 72            # points a curve in the alignment
+TOLERANCE_PX = 3.0      # epipolar distance at which a point gains nothing
+WORST = -1.5            # the most a point costs, in lengths
+SHORTEST_PX = 60.0      # of both curves together
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Two curves that correspond; arc lengths in px along curve A and curve B, both increasing."""
+
+    a: int                  # index of the candidate in plane A
+    b: int                  # and in plane B
+    flipped: bool           # B is to be read from its last point to its first
+    score: float            # root of the matched length of both (px), times the square of its share, times the weights
+    along_a: np.ndarray     # (K,) px
+    along_b: np.ndarray     # (K,) px; from the last point when flipped
+
+
+def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[np.ndarray], F: np.ndarray, best: int = 4) -> list[Alignment]:
+    """The `best` alignments among all pairs of (N, 2) undistorted curves, best first; F maps A to B. `weights`: how much each
+    curve of A and of B counts. Empty where nothing fits."""
+    if not curves_a or not curves_b:
+        return []
+    a, length_a = _sampled(curves_a)
+    b, length_b = _sampled(curves_b)
+    gains = []
+    for ia in range(len(a)):
+        lines = epipolar_lines(F, a[ia])                                        # in B
+        to_b = np.einsum('ik,njk->nij', lines[:, :2], b) + lines[None, :, 2:]   # (nb, S, S)
+        back = epipolar_lines(F.T, b.reshape(-1, 2)).reshape(len(b), SAMPLES, 3)
+        to_a = np.einsum('njk,ik->nij', back[..., :2], a[ia]) + back[:, None, :, 2]
+        d = np.minimum(_distance_across(to_b, 2), _distance_across(to_a, 1))
+        gains.append(np.maximum(1 - (d / TOLERANCE_PX) ** 2, WORST))
+    gain = np.stack(gains)                                                      # (na, nb, S, S)
+    gain = np.stack([gain, gain[..., ::-1]], axis=2)                            # and B read backwards: (na, nb, 2, S, S)
+    step_a = (length_a / (SAMPLES - 1))[:, None, None, None]
+    step_b = (length_b / (SAMPLES - 1))[None, :, None, None]
+    total = _fill(gain, step_a, step_b)
+    flat = total.reshape(len(a), len(b), 2, -1)
+    matched = flat.max(axis=3)
+    share = matched / (length_a[:, None, None] + length_b[None, :, None])
+    score = np.sqrt(matched) * share**2 * weights[0][:, None, None] * weights[1][None, :, None]    # a device is seen whole by both
+    found = []
+    for k in np.argsort(-score, axis=None)[:best]:
+        ia, ib, flip = np.unravel_index(k, score.shape)
+        if matched[ia, ib, flip] < SHORTEST_PX:
+            continue
+        i, j = _trace(total[ia, ib, flip], gain[ia, ib, flip], float(length_a[ia]), float(length_b[ib]))
+        if min(np.ptp(i), np.ptp(j)) < 5:       # a point of one plane against a line of the other is no curve
+            continue
+        found.append(Alignment(int(ia), int(ib), bool(flip), float(score[ia, ib, flip]), i * length_a[ia] / (SAMPLES - 1), j * length_b[ib] / (SAMPLES - 1)))
+    return found
+
+
+def _sampled(curves: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, SAMPLES, 2) evenly spaced points of each curve and (n,) lengths in px."""
+    lengths = np.array([arc_length(c)[-1] for c in curves])
+    return np.stack([at_arc_length(c, np.linspace(0, n, SAMPLES)) for c, n in zip(curves, lengths)]), lengths
+
+
+def _distance_across(signed: np.ndarray, axis: int) -> np.ndarray:
+    """|signed|, and 0 where the curve crosses the line before or after this sample along `axis`."""
+    d = np.abs(signed)
+    s = np.moveaxis(signed, axis, -1)
+    out = np.moveaxis(d, axis, -1)      # a view: writes go to d
+    crosses = s[..., :-1] * s[..., 1:] <= 0
+    out[..., :-1][crosses] = 0
+    out[..., 1:][crosses] = 0
+    return d
+
+
+def _fill(gain: np.ndarray, step_a, step_b) -> np.ndarray:
+    """(..., S, S) best score of an alignment that ends at each pair of samples; rows one after another, all pairs of curves at once."""
+    total = np.zeros_like(gain)
+    before = np.zeros(gain.shape[:-2] + (gain.shape[-1],))
+    for i in range(gain.shape[-2]):
+        g = gain[..., i, :]
+        diagonal = np.concatenate([np.zeros_like(before[..., :1]), before[..., :-1]], axis=-1) + g * (step_a + step_b)
+        start = np.maximum(np.maximum(before + g * step_a, diagonal), 0)
+        run = np.cumsum(g * step_b, axis=-1)                        # moving along B only: a running sum ...
+        before = run + np.maximum.accumulate(start - run, axis=-1)  # ... from the best place to enter it
+        total[..., i, :] = before
+    return total
+
+
+def _trace(total: np.ndarray, gain: np.ndarray, length_a: float, length_b: float) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) and (K,) samples along the best alignment, from its first to its last."""
+    sa, sb = length_a / (SAMPLES - 1), length_b / (SAMPLES - 1)
+    i, j = np.unravel_index(np.argmax(total), total.shape)
+    path = [(i, j)]
+    while i > 0 and j > 0 and total[i, j] > 0:
+        g = gain[i, j]
+        options = (total[i - 1, j - 1] + g * (sa + sb), total[i - 1, j] + g * sa, total[i, j - 1] + g * sb)
+        k = int(np.argmax(options))
+        if options[k] <= 1e-9:
+            break
+        i, j = i - (k != 2), j - (k != 1)
+        path.append((i, j))
+    path = np.array(path[::-1], float)
+    return path[:, 0], path[:, 1]

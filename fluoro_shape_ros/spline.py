@@ -1,0 +1,61 @@
+"""A cubic B-spline in space on a uniform knot vector over arc length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from .curve import arc_length, at_arc_length
+
+KNOT_SPACING = 0.008        # m: a device bends with radii of some cm
+MIN_CONTROL, MAX_CONTROL = 7, 48
+
+
+@dataclass(frozen=True)
+class Spline3:
+    """X(s) = sum_j B_j(s) C_j for s in [start, stop], about arc length in m."""
+
+    start: float
+    stop: float
+    control: np.ndarray     # (n, 3) m
+
+    def basis(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """(N, n) basis functions, or a derivative of them, at (N,) arc lengths; uniform knots, so that equal control point
+        steps are equal speed right to the ends."""
+        n = len(self.control)
+        knots = self.start + (np.arange(n + 4) - 3) * (self.stop - self.start) / (n - 3)
+        return BSpline(knots, np.eye(n), 3)(s, derivative)
+
+    def __call__(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """(N, 3) points, or derivatives."""
+        return self.basis(s, derivative) @ self.control
+
+
+def bending(n: int) -> np.ndarray:
+    """(n - 3, n) third differences of the control points: zero for a curve of constant curvature, as a robot's tubes bend."""
+    return np.diff(np.eye(n), 3, axis=0)
+
+
+def through(points: np.ndarray, extension: float, smoothing: float = 1e-3) -> Spline3:
+    """The spline over arc length near (N, 3) points in m, going on by `extension` m at both ends; s = 0 at the first point."""
+    length = arc_length(points)[-1]
+    s = np.linspace(0, length, max(int(length / 0.0005), 50))
+    points = at_arc_length(points, s)
+    start, stop = -extension, length + extension
+    n = int(np.clip(np.ceil((stop - start) / KNOT_SPACING) + 3, MIN_CONTROL, MAX_CONTROL))
+    B = Spline3(start, stop, np.zeros((n, 3))).basis(s)
+    D = bending(n)
+    H = B.T @ B + smoothing * len(s) / n * D.T @ D
+    return Spline3(start, stop, np.linalg.solve(H, B.T @ points))
+
+
+def prolong(spline: Spline3, ends: tuple[bool, bool], by: float) -> tuple[Spline3, float]:
+    """The spline going on straight by `by` m at the first and / or last end, and what is to be added to its old arc lengths."""
+    s = np.linspace(spline.start, spline.stop, 400)
+    points, (first, last) = spline(s), spline(s[[0, -1]], 1)
+    before = points[0] - np.linspace(by, 0, 20, endpoint=False)[:, None] * first if ends[0] else points[:0]
+    after = points[-1] + np.linspace(0, by, 21)[1:, None] * last if ends[1] else points[:0]
+    longer = through(np.concatenate([before, points, after]), 0.0)
+    return longer, -spline.start + (by if ends[0] else 0.0)
