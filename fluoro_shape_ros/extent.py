@@ -1,0 +1,89 @@
+"""Where along the curve the device is, and exactly where it ends: an edge along the axis, solved in both planes at once."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.special import ndtr
+
+PRESENT = 0.5           # of the usual darkness
+HIDDEN = 0.15           # a plane that shows even less than this may be hidden there
+BRIDGED_PX = 70         # a stretch that only one plane shows, or none up to GAP_PX, does not end the device
+GAP_PX = 30
+SMOOTH_PX = 9
+REACH_PX = 12.0         # the edge is looked for this far around the first guess
+BLURS_PX = (0.8, 1.1, 1.5, 2.2)
+OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
+FLOOR_PX = 0.12         # what the model of the edge itself is worth
+
+
+def supported(presence: np.ndarray) -> tuple[int, int] | None:
+    """First and last index of the device's stretch of (N, 2) presence (NaN: outside the field), steps of about a pixel; None where there is none."""
+    smooth = cv2.blur(np.nan_to_num(np.clip(presence, -1, 2)).astype(np.float32), (1, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE)
+    both, either = (smooth > PRESENT).all(axis=1), (smooth > PRESENT).any(axis=1)
+    at = np.nonzero(both)[0]
+    if len(at) < 5:
+        return None
+    gaps = np.nonzero(np.diff(at) > 1)[0]
+    # a gap is bridged when it is short, or when one plane shows the device nearly all the way
+    cut = [g for g in gaps if at[g + 1] - at[g] > GAP_PX and not (at[g + 1] - at[g] <= BRIDGED_PX and either[at[g]:at[g + 1]].mean() > 0.8)]
+    starts, stops = np.r_[0, np.array(cut, int) + 1], np.r_[np.array(cut, int), len(at) - 1]
+    best = np.argmax([both[at[i]:at[j] + 1].sum() for i, j in zip(starts, stops)])
+    return int(at[starts[best]]), int(at[stops[best]])
+
+
+def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.ndarray) -> np.ndarray:
+    """(2,) m by which the shadow of a flat end reaches beyond the axis' end in each plane, seen at an angle.
+
+    The end's rim is an ellipse. An opaque device shows all of it: r cos / sin of the angle between ray and axis, times 0.78 on average over the width.
+    A translucent one fades from r cos before the end to r cos after it and is half as dark (Beer-Lambert) a little past the middle. `contrast` (2,)
+    tells which.
+    """
+    sine = np.clip(speed / px_per_m, 0.2, 1.0)
+    opaque = 0.78 * np.clip((contrast - OPAQUE[0]) / (OPAQUE[1] - OPAQUE[0]), 0.0, 1.0)
+    depth = -np.log1p(-np.clip(contrast, 0.01, 0.95))                   # mu 2 r
+    half_dark = -np.log1p(-0.5 * np.clip(contrast, 0.01, 0.95)) / depth # share of the full path that takes half of it
+    return np.maximum(opaque, 0.5 * (1 - 2 * half_dark)) * radius * np.sqrt(1 - sine**2) / sine
+
+
+def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: float, outward: int, beyond: np.ndarray) -> tuple[float, float]:
+    """Arc length (m) where the device ends, and its standard deviation (m).
+
+    s: (N,) m. presence: (N, 2), sigma: (2,) its noise, speed: (N, 2) px per m. outward: +1 for the end at large s, -1 at small.
+    beyond: (2,) m, see `bulge`. Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both
+    planes, residuals clipped at 3.5 sigma.
+    """
+    here = int(np.argmin(np.abs(s - guess)))
+    px_per_m = np.mean(speed[here])
+    end = guess + np.arange(-REACH_PX, REACH_PX + 0.01, 0.2) / px_per_m        # (E,)
+    near = (np.abs(s - guess) * px_per_m < REACH_PX + 12)
+    cost, information = np.zeros(len(end)), np.zeros(len(end))
+    single = []
+    for v in range(2):
+        rows = near & np.isfinite(presence[:, v])
+        if rows.sum() < 12 or not np.isfinite(sigma[v]):
+            continue
+        y, weight = presence[rows, v], 1 / max(sigma[v], 0.02) ** 2
+        z = (outward * (end[:, None] - s[rows]) + beyond[v]) * speed[rows, v]                 # (E, n) px inside the device
+        best, best_information = None, None
+        for blur in BLURS_PX:
+            m = ndtr(z / blur)
+            a = np.clip((m @ y) / np.maximum((m * m).sum(axis=1), 1e-9), 0.5, 1.8)
+            c = (np.minimum((y - a[:, None] * m) ** 2 * weight, 12)).sum(axis=1)
+            slope = a[:, None] * np.exp(-0.5 * (z / blur) ** 2) / (blur * np.sqrt(2 * np.pi)) * speed[rows, v]
+            if best is None or c.min() < best.min():
+                best, best_information = c, (slope**2).sum(axis=1) * weight
+        cost, information = cost + best, information + best_information
+        single.append((end[np.argmin(best)], 1 / np.sqrt(best_information[np.argmin(best)] + 1e-12)))
+    if not single:
+        return guess, float('inf')
+    k = int(np.clip(np.argmin(cost), 1, len(end) - 2))
+    left, middle, right = cost[k - 1:k + 2]
+    bow = left - 2 * middle + right
+    at = end[k] + (0.5 * (left - right) / bow * (end[1] - end[0]) if bow > 0 else 0.0)
+    variance = 1 / (information[k] + 1e-12) + (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2
+    if len(single) == 2:        # planes that disagree by more than noise: the truth lies somewhere between
+        apart = abs(single[0][0] - single[1][0])
+        if apart > 3 * np.hypot(single[0][1], single[1][1]) + 0.7 / px_per_m:
+            variance += (apart / 2) ** 2
+    return float(at), float(np.sqrt(variance))
