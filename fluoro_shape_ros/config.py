@@ -47,7 +47,7 @@ class DetectionConfig:
 class CurveConfig:
     """How the backbone is put together and which end is its tip."""
 
-    method: str = _p('paper', 'paper: the published method of 2011, step by step', choices=('paper',))
+    method: str = _p('spline', 'spline: a 3-D spline fitted to both images at once; paper: the published method of 2011, step by step', choices=('spline', 'paper'))
     backbone_spacing: float = _p(0.001, 'Arc-length step of the published backbone', unit='m', low=1e-5, high=0.1)
     base_position: tuple[float, ...] = _p((), 'Where the device enters, x y z in the reference frame; empty: unknown', unit='m', element=float)
     tracking: bool = _p(True, 'Start from the previous result')

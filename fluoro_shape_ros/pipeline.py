@@ -1,4 +1,4 @@
-"""A pair of images walks straight through: segment both, correspond, triangulate, decide the tip, doubt, answer."""
+"""A pair of images walks straight through: prepare, find and fit the device, decide the tip, doubt, answer."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from scipy.spatial import cKDTree
 
 from . import paper
 from .config import Config
-from .curve import arc_length, resample
+from .curve import arc_length, even_steps, resample
 from .data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
+from .detect import detect, track
 from .ends import tip_is_last
 from .field import border_distance, field_of_view
+from .fit import Fit
 from .geometry import GeometryError, check_pair, distort, pixels_per_metre, project, undistort
-from .plausibility import check_curvature, check_length, check_reprojection, curvature_limit
+from .mask import subtract
+from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
 
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 
@@ -27,11 +30,45 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
         check_pair(frame.views)
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
-
-    images = [dark_device(image, config.detection.polarity) for image in frame.images]
-    fields = [field_of_view(image) for image in frame.images]
+    fields = tuple(field_of_view(image) for image in frame.images)
+    images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
+    images = tuple(dark_device(image, config.detection.polarity) for image in images)
     clock.lap('prepare')
+    by = _by_paper if config.curve.method == 'paper' else _by_spline
+    return by(frame, images, fields, config, prior, clock)
 
+
+def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, clock: _Stopwatch) -> Reconstruction:
+    """method:=spline: both images are fitted at once, from where the device was or from a search of the whole images."""
+    images = tuple(cv2.sqrt(np.maximum(image, 0)) for image in images)     # Anscombe: quantum noise gets the same variance everywhere
+    radius = config.detection.robot_radius
+    found = None
+    if config.curve.tracking and prior.previous is not None:
+        found = track(images, fields, frame.views, radius, prior.previous.points)
+        clock.lap('track')
+    if found is None:
+        found = detect(images, fields, frame.views, radius, config.detection.min_length_px)
+        clock.lap('detect')
+    seen = tuple(None if px is None else Centerline(px) for px in found.seen_px)
+    if found.fit is None:
+        return Reconstruction(found.outcome, found.detail, centerlines=seen, stage_seconds=clock.laps)
+
+    f = found.fit
+    ends = f.spline(np.array([f.start, f.stop]))
+    forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, prior)
+    shape = backbone(f, forward, config.curve.backbone_spacing)
+    clock.lap('backbone')
+    metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
+    doubt = (check_fit(f, config) or check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
+             or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
+    clock.lap('plausibility')
+    if doubt:
+        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps)
+    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps)
+
+
+def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, clock: _Stopwatch) -> Reconstruction:
+    """method:=paper: segment each image, correspond, triangulate, and believe eq. 3."""
     widths = paper.half_width_px(frame.views, config)
     seen = tuple(_centerline(paper.segment(image, width, config.detection.min_length_px), field, width)
                  for image, field, width in zip(images, fields, widths))
@@ -47,7 +84,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
 
     best = max(curves, key=lambda c: arc_length(c)[-1])
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, best) for v in frame.views])
-    forward, guessed = _tip_is_last(best, frame, fields, seen, config, prior)
+    forward, guessed = _tip_rule(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, prior)
     points, s = resample(best if forward else best[::-1], config.curve.backbone_spacing)
     residuals = residuals_px(points, frame.views, seen)
     clock.lap('curve')
@@ -59,6 +96,30 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
         return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps)
     shape = Shape(points, s, np.full((len(points), 3, 3), np.nan), residuals)   # the published method knows no covariance
     return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps)
+
+
+def backbone(f: Fit, forward: bool, step: float) -> Shape:
+    """The fitted spline at equal arc-length steps from base to tip, with the covariance of each point.
+
+    Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of the end.
+    """
+    u = np.linspace(f.start, f.stop, max(int((f.stop - f.start) / 2e-4), 50))
+    if not forward:
+        u = u[::-1]
+    along = arc_length(f.spline(u))
+    s = even_steps(along[-1], step)
+    at = np.interp(s, along, u)
+    points, basis = f.spline(at), f.spline.basis(at)
+    n = len(f.spline.control)
+    covariance = np.einsum('in,namb,im->iab', basis, f.covariance.reshape(n, 3, n, 3), basis, optimize=True)
+    tangent = f.spline(at[[0, -1]], 1)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    sigma = f.end_sigma if forward else f.end_sigma[::-1]
+    covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
+    known = [np.isfinite(o) for o in f.offset_px.T]
+    residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan) if k.any() else np.full(len(at), np.nan)
+                          for o, k in zip(f.offset_px.T, known)], axis=1)
+    return Shape(points, s, covariance, residuals)
 
 
 def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
@@ -92,17 +153,20 @@ def _centerline(points_px: np.ndarray, field: np.ndarray, half_width_px: float) 
     return Centerline(points_px, 2 * half_width_px, (bool(first), bool(last)))
 
 
-def _tip_is_last(points: np.ndarray, frame: Frame, fields, seen, config: Config, prior: Prior) -> tuple[bool, bool]:
-    """The tip rule on a backbone candidate (N, 3): its ends as each plane sees them."""
-    ends_px = [distort(v, project(v.P, points[[0, -1]])) for v in frame.views]
-    border_px = np.stack([border_distance(f, e) for f, e in zip(fields, ends_px)], axis=1)
+def _at_border(ends: np.ndarray, views, seen) -> tuple[bool, bool]:
+    """Whether each of a backbone's two ends belongs to a centreline's end at the field's border, in either plane."""
     at_border = np.zeros(2, bool)
-    for line, ends in zip(seen, ends_px):       # an end of the backbone belongs to the nearer end of each centreline
-        for k, end in enumerate(ends):
-            nearest = np.linalg.norm(line.points_px[[0, -1]] - end, axis=1).argmin()
-            at_border[k] |= line.at_border[nearest]
+    for line, view in zip(seen, views):
+        for k, end in enumerate(distort(view, project(view.P, ends))):
+            at_border[k] |= line.at_border[np.linalg.norm(line.points_px[[0, -1]] - end, axis=1).argmin()]
+    return bool(at_border[0]), bool(at_border[1])
+
+
+def _tip_rule(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, prior: Prior) -> tuple[bool, bool]:
+    """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
+    border_px = np.stack([border_distance(f, distort(v, project(v.P, ends))) for f, v in zip(fields, views)], axis=1)
     previous = prior.previous.points if prior.previous is not None else None
-    return tip_is_last(points[[0, -1]], tuple(at_border), border_px, config.curve.base_position, previous)
+    return tip_is_last(ends, at_border, border_px, config.curve.base_position, previous)
 
 
 class _Stopwatch:

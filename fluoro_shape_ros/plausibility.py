@@ -7,6 +7,43 @@ import numpy as np
 from .config import Config
 from .curve import curvature
 from .data import Outcome
+from .fit import Fit, shown
+
+MIN_LIKENESS = 0.86     # correlation of the profile seen with a cylinder's of robot_radius, in the worse plane
+MAX_CONTRAST_RATIO = 2.0
+MIN_SHOWN = 0.6         # share of the device's length that each plane must show
+MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
+MIN_CONTRAST = 0.02
+
+
+def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
+    """Whether what both planes show along a fitted curve is one device: None, or the rejection."""
+    length_px = (f.stop - f.start) / (f.s[1] - f.s[0])
+    if length_px < config.detection.min_length_px:
+        return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
+    if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
+        return Outcome.POORLY_EXPLAINED, f'its profile is not that of a device of robot_radius (likeness {f.likeness[0]:.2f}, {f.likeness[1]:.2f})'
+    ratio = float(f.contrast.max() / f.contrast.min())
+    if ratio > MAX_CONTRAST_RATIO:
+        return Outcome.DIRECTIONS_DISAGREE, f'one plane shows it {ratio:.1f} times as dark as the other'
+    share = shown(f)
+    if share.min() < MIN_SHOWN:
+        return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
+    for k, name in enumerate(('first', 'last')):
+        if not f.open_end[k] and f.beyond[k].max() > MAX_BEYOND:
+            return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
+    if all(f.open_end):
+        return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
+    return None
+
+
+def check_tip(covariance: np.ndarray, config: Config) -> tuple[Outcome, str] | None:
+    """Standard deviation of the tip in its worst direction, from its (3, 3) covariance in m^2: None, or the rejection."""
+    limit = config.plausibility.max_tip_sigma
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    if limit and not sigma <= limit:
+        return Outcome.TIP_UNCERTAIN, f'tip sigma {sigma * 1000:.2f} mm exceeds {limit * 1000:.2f} mm'
+    return None
 
 
 def curvature_limit(config: Config, metres_per_px: float) -> float:
