@@ -105,10 +105,16 @@ def intensifier(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
 def occluder(rng: np.random.Generator, shape: tuple[int, int], centre_px: np.ndarray) -> np.ndarray:
     """A dense implant-like plate about `centre_px` (u, v) that lets 5 to 15 % through."""
     w = shape[1]
-    box = (tuple(float(c) for c in centre_px), (rng.uniform(0.04, 0.08) * w, rng.uniform(0.06, 0.12) * w), rng.uniform(0, 180))
-    plate = np.zeros(shape, np.uint8)
-    cv2.fillConvexPoly(plate, np.rint(cv2.boxPoints(box) * 16).astype(np.int32), 255, cv2.LINE_AA, 4)
-    return 1 - plate * np.float32(rng.uniform(0.85, 0.95) / 255)
+    size_px, turn = (rng.uniform(0.04, 0.08) * w, rng.uniform(0.06, 0.12) * w), np.deg2rad(rng.uniform(0, 180))
+    return plate(shape, centre_px, size_px, turn, 1 - rng.uniform(0.85, 0.95))
+
+
+def plate(shape: tuple[int, int], centre_px: np.ndarray, size_px: tuple[float, float], turn: float, share: float) -> np.ndarray:
+    """A rectangle about `centre_px` (u, v) that lets `share` through; its first side lies at `turn` rad from u towards v."""
+    box = (tuple(float(c) for c in centre_px), tuple(float(n) for n in size_px), float(np.rad2deg(turn)))
+    drawn = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(drawn, np.rint(cv2.boxPoints(box) * 16).astype(np.int32), 255, cv2.LINE_AA, 4)
+    return 1 - drawn * np.float32((1 - share) / 255)
 
 
 def burn_in(image: np.ndarray, lines: tuple[str, ...] = ('FLUORO 15 P/S', '78 KV  4.1 MA', 'SIM')) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -15,10 +16,10 @@ MARGIN_PX = 40                          # between the device and the field's bor
 MIN_RAY_ANGLE = np.deg2rad(20)          # of the device's tangent to either viewing ray, everywhere
 MIN_EPIPOLAR_ANGLE = np.deg2rad(20)     # of the projected device to its epipolar line ...
 MIN_EPIPOLAR_SHARE = 0.8                # ... over this share of its length
+HARD_EPIPOLAR_SHARE = 0.5               # ... which suffices for a shape that is meant to be hard
+CLEAR = 0.010                           # m of device on both sides of a turn or crossing
 LONGEST_SHAFT = 0.6                     # m
 ATTEMPTS = 5000
-
-KINDS = {'spline': shapes.random_spline, 'cannula': shapes.random_cannula}
 
 
 @dataclass(frozen=True)
@@ -48,39 +49,92 @@ def lit_field(view: View, aperture: np.ndarray | None) -> Field:
 def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, lengths: tuple[float, float], entering: bool) -> tuple:
     """A random shape that two fields see well, and the length in m of the straight shaft behind it (0 unless `entering`).
 
-    Draws until the shape is `well_seen`, stands MARGIN_PX inside both fields wherever it moves, and, when `entering`, until its shaft leaves both.
+    Draws until the shape suits its kind, stands MARGIN_PX inside both fields wherever it moves, and, when `entering`, until its shaft leaves both.
     Raises ValueError where no such shape turns up.
     """
     if kind not in KINDS:
         raise ValueError(f'no shape is called {kind!r}: there are {", ".join(KINDS)}')
     views = tuple(f.view for f in fields)
+    make, suits = KINDS[kind]
     for _ in range(ATTEMPTS):
-        shape = KINDS[kind](rng, rng.uniform(*lengths))
-        if not well_seen(shape.backbone(2e-3), views) or not _stays_inside(shape, fields):
+        shape = make(rng, rng.uniform(*lengths))
+        if not suits(shape.backbone(2e-3), views) or not _stays_inside(shape, fields):
             continue
         if not entering:
             return shape, 0.0
         shaft = _shaft_to_border(shape, fields)
-        if shaft and well_seen(seen_in_both(with_shaft(shape.backbone(2e-3), shaft), fields), views):
+        if shaft and suits(seen_in_both(with_shaft(shape.backbone(2e-3), shaft), fields), views):
             return shape, shaft
     raise ValueError(f'no {kind} of {lengths[0] * 1000:g} to {lengths[1] * 1000:g} mm fits well into both fields ({ATTEMPTS} tried)')
 
 
-def well_seen(points: np.ndarray, views: tuple[View, View]) -> bool:
-    """Whether (N, 3) points keep off both viewing rays, and most of them off their epipolar lines."""
-    steps, middles = np.diff(points, axis=0), (points[1:] + points[:-1]) / 2
-    steps = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+def well_seen(points: np.ndarray, views: tuple[View, View], share: float = MIN_EPIPOLAR_SHARE) -> bool:
+    """Whether (N, 3) points keep off both viewing rays, and `share` of them off their epipolar lines."""
     for view, other in (views, views[::-1]):
+        steps, middles = np.diff(points, axis=0), (points[1:] + points[:-1]) / 2
         ray = middles - source(view.P)
-        along = np.abs(np.einsum('ni,ni->n', steps, ray)) / np.linalg.norm(ray, axis=1)
+        along = np.abs(np.einsum('ni,ni->n', steps, ray)) / np.linalg.norm(steps, axis=1) / np.linalg.norm(ray, axis=1)
         if along.max() > np.cos(MIN_RAY_ANGLE):
             return False
-        lines = epipolar_lines(fundamental(other.P, view.P), project(other.P, middles))
-        uv = np.diff(project(view.P, points), axis=0)
-        across = np.abs(np.einsum('ni,ni->n', uv, lines[:, :2])) / np.linalg.norm(uv, axis=1)     # sine of the angle
-        if np.mean(across > np.sin(MIN_EPIPOLAR_ANGLE)) < MIN_EPIPOLAR_SHARE:
+        if np.mean(np.abs(_across(points, view, other)) > np.sin(MIN_EPIPOLAR_ANGLE)) < share:
             return False
     return True
+
+
+def turns_back(points: np.ndarray, views: tuple[View, View]) -> bool:
+    """Whether (N, 3) points, else seen well enough, turn back in the pencil of epipolar planes: there both images are tangent to
+    their epipolar lines, and beside it the lines meet the device twice."""
+    rising = _across(points, *views) > 0
+    aside = _clear_steps(points)
+    turns = [k for k in range(aside, len(rising) - aside + 1) if (rising[k - aside:k] != rising[k]).all() and (rising[k:k + aside] == rising[k]).all()]
+    return bool(turns) and well_seen(points, views, HARD_EPIPOLAR_SHARE)
+
+
+def crosses_itself(points: np.ndarray, views: tuple[View, View]) -> bool:
+    """Whether (N, 3) points, else seen well enough, cross themselves in either image, not near an end."""
+    aside = _clear_steps(points)
+    return any(_crosses(project(v.P, points[aside:-aside])) for v in views) and well_seen(points, views, HARD_EPIPOLAR_SHARE)
+
+
+def _across(points: np.ndarray, view: View, other: View) -> np.ndarray:
+    """(N - 1,) sine of the signed angle between the projected steps of (N, 3) points and their epipolar lines."""
+    lines = epipolar_lines(fundamental(other.P, view.P), project(other.P, (points[1:] + points[:-1]) / 2))
+    uv = np.diff(project(view.P, points), axis=0)
+    return np.einsum('ni,ni->n', uv, lines[:, :2]) / np.linalg.norm(uv, axis=1)
+
+
+def _clear_steps(points: np.ndarray) -> int:
+    """How many of the equal steps of (N, 3) points CLEAR is."""
+    return int(np.ceil(CLEAR / np.linalg.norm(points[1] - points[0])))
+
+
+def _crosses(uv: np.ndarray) -> bool:
+    """Whether two segments of the (N, 2) polyline intersect that do not share a point."""
+    a, d = uv[:-1], np.diff(uv, axis=0)
+    cross = d[:, None, 0] * d[None, :, 1] - d[:, None, 1] * d[None, :, 0]
+    gap = a[None] - a[:, None]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        t = (gap[..., 0] * d[None, :, 1] - gap[..., 1] * d[None, :, 0]) / cross     # along the row's segment; along the column's: its transpose
+    return bool(np.triu((t >= 0) & (t <= 1) & (t.T >= 0) & (t.T <= 1), 2).any())
+
+
+def _looped(rng: np.random.Generator, length: float) -> shapes.Spline:
+    """A loose turn of a screw, as a catheter loops: seen along the screw's axis it crosses itself. It bends as tight as other shapes do."""
+    knots = np.arange(max(4, int(np.ceil(length / shapes.KNOT_SPACING)) + 1))
+    pitch = rng.uniform(0.3, 0.6) + rng.normal(0, 0.05, len(knots))
+    yaw = shapes.MAX_CURVATURE * shapes.KNOT_SPACING * knots + rng.normal(0, 0.05, len(knots))
+    shape = shapes.Spline(length, np.c_[yaw, pitch])
+    tightest = np.hypot(*shape.angles()(np.linspace(0.0, length, 500), 1).T).max()
+    return shapes.centred(rng, shapes.Spline(length, np.c_[yaw * rng.uniform(0.9, 1.0) * shapes.MAX_CURVATURE / tightest, pitch]))
+
+
+# what a kind of shape is drawn from, and what its (N, 3) points must suit, seen in two views
+KINDS: dict[str, tuple[Callable, Callable]] = {
+    'spline': (shapes.random_spline, well_seen),
+    'cannula': (shapes.random_cannula, well_seen),
+    'tangent': (shapes.random_spline, turns_back),
+    'crossing': (_looped, crosses_itself),
+}
 
 
 def with_shaft(backbone: np.ndarray, shaft: float) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..data import Frame, View
@@ -19,6 +21,7 @@ RADIUS = 0.0006                     # m
 CLUTTER = ('leads', 'wire', 'blades', 'field', 'occluder', 'text')
 RENDERERS = ('vtk', 'xray')
 DEVICE, BACKGROUND = 0.12, 0.75     # grey levels of protocol P
+NOISE_VARIANCE = 0.002              # of protocol P, on [0, 1]
 BIPLANE = carm.biplane()
 PROTOCOL_P = carm.biplane(arm=carm.CArm(pixel_size_iso=0.523e-3))
 
@@ -69,15 +72,31 @@ class Run:
         images = tuple(self._image(whole, i, rng) for i in (0, 1))
         return Frame(stamp_ns, FRAME_ID, images, tuple(f.view for f in self.fields))
 
+    def expected(self, whole: np.ndarray | None, i: int, shift_px: tuple[float, float] = (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) float32 each: plane `i`'s blurred image before noise, as a share of full scale (P) or of the open beam (X-ray), and the
+        variance of the noise that each pixel gets; the device's shadow is moved by `shift_px` (u, v)."""
+        sharp = self._sharp(whole, i, shift_px)
+        if self.exposure is None:
+            return cv2.GaussianBlur(sharp, (5, 5), 0), np.full_like(sharp, NOISE_VARIANCE)     # as vtk_scene.degrade blurs
+        beam = xray.blurred(sharp, self.exposure)
+        return beam, beam / np.float32(self.exposure.photons)
+
     def _image(self, whole: np.ndarray | None, i: int, rng: np.random.Generator) -> np.ndarray:
+        sharp = self._sharp(whole, i)
+        if self.exposure is None:
+            return vtk_scene.degrade(sharp, rng, NOISE_VARIANCE)
+        image = xray.expose(sharp, self.exposure, rng)
+        return surroundings.burn_in(image) if self.text else image
+
+    def _sharp(self, whole: np.ndarray | None, i: int, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+        """(H, W) float32: grey levels (P) or the transmitted beam (X-ray) in plane `i`, before blur and noise."""
         view = self.fields[i].view
+        view = dataclasses.replace(view, P=view.P + np.outer([*shift_px, 0.0], view.P[2]))      # moves the principal point
         bare = np.ones((view.height, view.width), np.float32)
         if self.exposure is None:
-            image = bare * np.float32(BACKGROUND) if whole is None else grey(whole, self.radius, view, self.renderer)
-            return vtk_scene.degrade(image, rng)
+            return bare * np.float32(BACKGROUND) if whole is None else grey(whole, self.radius, view, self.renderer)
         beam = bare if whole is None else xray.transmission(whole, self.radius, view, self.exposure)
-        image = xray.expose(beam if self.beams is None else beam * self.beams[i], self.exposure, rng)
-        return surroundings.burn_in(image) if self.text else image
+        return beam if self.beams is None else beam * self.beams[i]
 
 
 def grey(backbone: np.ndarray, radius: float, view: View, renderer: str) -> np.ndarray:
@@ -110,10 +129,11 @@ def protocol_p(seed: int, renderer: str = 'vtk', **options) -> Scene:
 
 
 def xray_run(seed: int, *, views=BIPLANE, exposure: xray.Exposure = xray.Exposure(), anatomy: bool = True, clutter: tuple[str, ...] = (),
-             kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS, entering: bool = False) -> Run:
+             kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS, entering: bool = False, hidden_px: float = 0.0) -> Run:
     """A run that looks like fluoroscopy: a metal device in front of an anatomy-like background and any of CLUTTER.
 
-    An occluder hides a part of the device in plane B only; a wire is a second, weaker device. The other options are those of `protocol_p_run`.
+    An occluder hides a part of the device in plane B only; a wire is a second, weaker device. With `hidden_px` a denser plate, in a plane
+    that the seed picks, hides so many px of the device, anywhere but near its ends. The other options are those of `protocol_p_run`.
     """
     if unknown := set(clutter) - set(CLUTTER):
         raise ValueError(f'no clutter is called {", ".join(sorted(unknown))}: there are {", ".join(CLUTTER)}')
@@ -135,6 +155,10 @@ def xray_run(seed: int, *, views=BIPLANE, exposure: xray.Exposure = xray.Exposur
         if 'occluder' in clutter and i == 1:
             beam = beam * surroundings.occluder(rng, size, project(view.P, points[len(points) // 2]))
         beams.append(beam)
+    if hidden_px:
+        rng = np.random.default_rng([seed, 5])
+        i = int(rng.integers(2))
+        beams[i] = beams[i] * _plate_over(rng, views[i], points, hidden_px)
     return Run('_'.join(['xray', kind, *clutter]), seed, fields, shape, shaft, radius, 'xray', exposure, tuple(beams), 'text' in clutter)
 
 
@@ -169,3 +193,11 @@ def _aperture(rng: np.random.Generator, view: View, clutter: tuple[str, ...]) ->
     makers = {'blades': surroundings.blades, 'field': surroundings.intensifier}
     parts = [make(rng, (view.height, view.width)) for name, make in makers.items() if name in clutter]
     return np.prod(parts, axis=0) if parts else None
+
+
+def _plate_over(rng: np.random.Generator, view: View, points: np.ndarray, hidden_px: float) -> np.ndarray:
+    """(H, W) float32: a plate of 0.3 to 2 % transmission across the image of (N, 3) points, so that it hides `hidden_px` of it."""
+    k = int(len(points) * rng.uniform(0.2, 0.8))
+    centre, ahead = project(view.P, points[[k, k + 5]])
+    turn = np.arctan2(*(ahead - centre)[::-1])
+    return surroundings.plate((view.height, view.width), centre, (hidden_px, rng.uniform(30, 90)), turn, rng.uniform(0.003, 0.02))

@@ -64,10 +64,14 @@ def transmission(backbone: np.ndarray, radius: float, view: View, exposure: Expo
     return cv2.exp(path_length(backbone, radius, view) * np.float32(-exposure.attenuation(radius)))
 
 
+def blurred(beam: np.ndarray, exposure: Exposure) -> np.ndarray:
+    """The (H, W) beam as focal spot and detector blur it."""
+    return cv2.GaussianBlur(beam, (0, 0), exposure.blur_px) if exposure.blur_px > 0 else beam
+
+
 def expose(beam: np.ndarray, exposure: Exposure, rng: np.random.Generator | None) -> np.ndarray:
     """(H, W) uint8 or uint16: the image of a (H, W) transmitted beam in [0, 1]; blurred, with quantum noise, or without for rng None."""
-    if exposure.blur_px > 0:
-        beam = cv2.GaussianBlur(beam, (0, 0), exposure.blur_px)
+    beam = blurred(beam, exposure)
     if rng is not None:
         beam = _quantum_noise(beam, exposure.photons, rng)
     full = 2**exposure.depth - 1
