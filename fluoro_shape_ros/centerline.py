@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
-from skimage.morphology import skeletonize
 
 RIDGE_Z = 3.5           # ridge points stand out from the noise by this many standard deviations ...
 BRANCH_Z = 5.0          # ... and branches by this, on average over their best half
-MAX_RIDGE_SHARE = 0.03  # of the pixels, at most: the strongest
-NMS_PX = 0.6            # a ridge point lies within this of its pixel's centre (0.5, and some for rounding)
+MAX_RIDGE_SHARE = 0.015 # of the pixels, at most: the strongest
+NMS_PX = 0.75           # a ridge point lies within this of its pixel's centre (0.5, and some for noise)
 END_PX = 12             # length over which the direction of a branch's end is measured
 GAP_PX = 48.0           # longest gap that is bridged, where it is straight
 MAX_TURN = np.deg2rad(50)    # ... the direction may change by this over a short gap
@@ -44,27 +43,42 @@ def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float) -> Ridges:
     second, one, first = np.float32([1, -2, 1]), np.float32([1]), np.float32([-0.5, 0, 0.5])
     uu = cv2.sepFilter2D(smooth, cv2.CV_32F, second, one)
     vv = cv2.sepFilter2D(smooth, cv2.CV_32F, one, second)
-    uv = cv2.sepFilter2D(smooth, cv2.CV_32F, first, first)
-    l2 = 0.5 * (cv2.add(uu, vv) + cv2.magnitude(cv2.subtract(uu, vv), 2 * uv))
+    uv = cv2.sepFilter2D(smooth, cv2.CV_32F, 2 * first, first)              # 2 I_uv
+    l2 = cv2.magnitude(cv2.subtract(uu, vv), uv)
+    cv2.add(l2, cv2.add(uu, vv), dst=l2)                                    # 2 l2, the larger eigenvalue of the Hessian
     margin = int(3 * sigma)
     inside = cv2.erode(field, np.ones((2 * margin + 1,) * 2, np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    some = inside[::4, ::4] > 0
+    some = inside[::8, ::4] > 0
     if not some.any():
         return _no_ridges()
-    noise = np.sqrt(3) * 1.4826 * float(np.median(np.abs(uv[::4, ::4][some]))) + 1e-12  # white noise: Var(uu) = 3 Var(uv)
-    sample = l2[::4, ::4][some]
-    level = max(RIDGE_Z * noise, float(np.quantile(sample, 1 - MAX_RIDGE_SHARE)))
-    v, u = np.nonzero((l2 > level) & (inside > 0))
-    h = uu[v, u], uv[v, u], vv[v, u], l2[v, u]
-    big = np.abs(h[3] - h[2]) > np.abs(h[3] - h[0])
-    nu, nv = np.where(big, h[3] - h[2], h[1]), np.where(big, h[1], h[3] - h[0])    # eigenvector of l2: across the ridge
+    noise = np.sqrt(3) * 1.4826 * float(np.median(np.abs(uv[::8, ::4][some]))) + 1e-12  # white noise: Var(uu) = 3 Var(uv); of 2 l2
+    sample = l2[::8, ::4][some]
+    level = max(RIDGE_Z * noise, float(np.partition(sample, int((1 - MAX_RIDGE_SHARE) * len(sample)))[int((1 - MAX_RIDGE_SHARE) * len(sample))]))
+    found = cv2.findNonZero(cv2.bitwise_and(cv2.compare(l2, level, cv2.CMP_GT), inside))
+    if found is None:
+        return _no_ridges()
+    u, v = found.reshape(-1, 2).T.astype(np.int64)      # OpenCV 4 gives (N, 1, 2), OpenCV 5 (N, 2)
+    at = v * image.shape[1] + u
+    gray, l2, uu, vv, uv = (a.ravel() for a in (smooth, l2, uu, vv, uv))
+    strength, i_uu, i_uv, i_vv = 0.5 * l2[at], uu[at], 0.5 * uv[at], vv[at]
+    big = np.abs(strength - i_vv) > np.abs(strength - i_uu)
+    nu, nv = np.where(big, strength - i_vv, i_uv), np.where(big, i_uv, strength - i_uu)     # eigenvector of l2: across the ridge
     norm = np.hypot(nu, nv) + 1e-30
     nu, nv = nu / norm, nv / norm
-    gu, gv = 0.5 * (smooth[v, u + 1] - smooth[v, u - 1]), 0.5 * (smooth[v + 1, u] - smooth[v - 1, u])
-    t = -(gu * nu + gv * nv) / h[3]
-    l1 = h[0] + h[2] - h[3]
-    keep = (np.abs(t * nu) <= NMS_PX) & (np.abs(t * nv) <= NMS_PX) & (np.abs(l1) < 0.7 * h[3])
-    return _branches(u[keep], v[keep], (u + t * nu)[keep], (v + t * nv)[keep], (h[3] / noise)[keep], image.shape)
+    w = image.shape[1]
+    gu, gv = 0.5 * (gray[at + 1] - gray[at - 1]), 0.5 * (gray[at + w] - gray[at - w])
+    t = -(gu * nu + gv * nv) / strength
+    du, dv = t * nu, t * nv
+    keep = np.nonzero((np.abs(du) <= NMS_PX) & (np.abs(dv) <= NMS_PX) & (np.abs(i_uu + i_vv - strength) < 0.7 * strength))[0]
+    # where two pixels side by side claim the ridge, the nearer one has it
+    index = np.full(image.size, -1, np.int32)
+    index[at[keep]] = np.arange(len(keep))
+    far = np.abs(t[keep])
+    beside = at[keep] + np.where(t[keep] > 0, 1, -1) * (np.rint(nv[keep]).astype(int) * w + np.rint(nu[keep]).astype(int))
+    rival = index[beside]
+    keep = keep[(rival < 0) | (far < far[rival]) | ((far == far[rival]) & (at[keep] < beside))]
+    u, v = u[keep], v[keep]
+    return _branches(u, v, u + du[keep], v + dv[keep], 2 * strength[keep] / noise, image.shape)
 
 
 def _no_ridges() -> Ridges:
@@ -72,12 +86,7 @@ def _no_ridges() -> Ridges:
 
 
 def _branches(u, v, su, sv, z, shape) -> Ridges:
-    """Thin the ridge pixels, cut them at junctions and sort them along their branches."""
-    mask = np.zeros(shape, bool)
-    mask[v, u] = True
-    mask = skeletonize(mask)
-    keep = mask[v, u]
-    u, v, su, sv, z = u[keep], v[keep], su[keep], sv[keep], z[keep]
+    """Cut the ridge pixels at junctions and sort them along their branches."""
     pairs = _neighbour_pairs(u, v, shape)
     degree = np.bincount(pairs.ravel(), minlength=len(u))
     alive = degree <= 2

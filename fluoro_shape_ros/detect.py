@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +17,13 @@ from .start import first_curve
 from .strips import cut_along, half_width_range, likeness, mean_profile
 
 LINES = 24              # strongest lines of an image that are looked at closely
-CANDIDATES = 8          # most device-like ones among them that are compared between the planes
+CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...
+HOPELESS = 0.03         # ... unless they are that much less like it than the best
 HYPOTHESES = 4          # alignments that are fitted before one is chosen
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
 UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
 EXPLAINED_PX = 3.0
-MIN_EXPLAINED = 0.7     # less of a line than this, and it is another line or only a part of the device is fitted
+MIN_EXPLAINED = 0.85    # less of a line than this, and it is another line or only a part of the device is fitted
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it
 NO_TIP = 0.2            # what is left of a line that leaves the field at both ends: it has no tip to show
 
@@ -40,7 +42,8 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     """Search both whole images (H, W float32, dark device) for the device of `radius` m."""
     center = isocenter(views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in views]
-    candidates = [candidates_of(image, field, w, min_length_px) for image, field, w in zip(images, fields, widths)]
+    with ThreadPoolExecutor(2) as pool:         # NumPy and OpenCV let go of the interpreter: both planes at once
+        candidates = list(pool.map(candidates_of, images, fields, widths, [min_length_px] * 2))
     best = tuple(c[0].points_px if c else None for c in candidates)
     for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if not found:
@@ -83,7 +86,8 @@ def candidates_of(image, field, half_width_px: float, min_length_px: float) -> l
         strips = cut_along(image, field, line.points_px, half_width_range(half_width_px))
         alike = likeness(mean_profile(strips, np.ones(len(strips.profiles), bool)), half_width_px)
         scored.append(replace(line, score=float(np.exp((np.clip(alike, 0, 1) - 1) / UNLIKE))))
-    return sorted(scored, key=lambda c: -c.score * np.sqrt(len(c.z)))[:CANDIDATES]
+    scored.sort(key=lambda c: -c.score * np.sqrt(len(c.z)))
+    return [c for c in scored[:CANDIDATES] if c.score > HOPELESS * scored[0].score]
 
 
 def explained(f: Fit, view, line_px: np.ndarray, visible: np.ndarray) -> float:

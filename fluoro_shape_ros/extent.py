@@ -55,26 +55,31 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     """
     here = int(np.argmin(np.abs(s - guess)))
     px_per_m = np.mean(speed[here])
-    end = guess + np.arange(-REACH_PX, REACH_PX + 0.01, 0.2) / px_per_m        # (E,)
-    near = (np.abs(s - guess) * px_per_m < REACH_PX + 12)
-    cost, information = np.zeros(len(end)), np.zeros(len(end))
-    single = []
-    for v in range(2):
-        rows = near & np.isfinite(presence[:, v])
-        if rows.sum() < 12 or not np.isfinite(sigma[v]):
-            continue
-        y, weight = presence[rows, v], 1 / max(sigma[v], 0.02) ** 2
-        z = (outward * (end[:, None] - s[rows]) + beyond[v]) * speed[rows, v]                 # (E, n) px inside the device
-        best, best_information = None, None
-        for blur in BLURS_PX:
+    near = np.abs(s - guess) * px_per_m < REACH_PX + 12
+    planes = [v for v in range(2) if (near & np.isfinite(presence[:, v])).sum() >= 12 and np.isfinite(sigma[v])]
+    rows = {v: near & np.isfinite(presence[:, v]) for v in planes}
+
+    def edges(v: int, end: np.ndarray, blurs) -> tuple[np.ndarray, np.ndarray, float]:
+        """(E,) cost and information of edges at `end` in plane v, with the blur that fits best."""
+        y, weight = presence[rows[v], v], 1 / max(sigma[v], 0.02) ** 2
+        z = (outward * (end[:, None] - s[rows[v]]) + beyond[v]) * speed[rows[v], v]     # (E, n) px inside the device
+        tried = []
+        for blur in blurs:
             m = ndtr(z / blur)
             a = np.clip((m @ y) / np.maximum((m * m).sum(axis=1), 1e-9), 0.5, 1.8)
-            c = (np.minimum((y - a[:, None] * m) ** 2 * weight, 12)).sum(axis=1)
-            slope = a[:, None] * np.exp(-0.5 * (z / blur) ** 2) / (blur * np.sqrt(2 * np.pi)) * speed[rows, v]
-            if best is None or c.min() < best.min():
-                best, best_information = c, (slope**2).sum(axis=1) * weight
-        cost, information = cost + best, information + best_information
-        single.append((end[np.argmin(best)], 1 / np.sqrt(best_information[np.argmin(best)] + 1e-12)))
+            cost = np.minimum((y - a[:, None] * m) ** 2 * weight, 12).sum(axis=1)
+            slope = a[:, None] * np.exp(-0.5 * (z / blur) ** 2) / (blur * np.sqrt(2 * np.pi)) * speed[rows[v], v]
+            tried.append((cost, (slope**2).sum(axis=1) * weight, blur))
+        return min(tried, key=lambda t: t[0].min())
+
+    end = guess + np.arange(-REACH_PX, REACH_PX + 0.01, 0.6) / px_per_m
+    coarse = {v: edges(v, end, BLURS_PX) for v in planes}
+    if planes:
+        best = end[np.argmin(sum(c[0] for c in coarse.values()))]
+        end = best + np.arange(-1.0, 1.01, 0.1) / px_per_m
+    fine = {v: edges(v, end, [coarse[v][2]]) for v in planes}
+    single = [(end[np.argmin(c)], 1 / np.sqrt(i[np.argmin(c)] + 1e-12)) for c, i, _ in fine.values()]
+    cost, information = sum(f[0] for f in fine.values()), sum(f[1] for f in fine.values())
     if not single:
         return guess, float('inf')
     k = int(np.clip(np.argmin(cost), 1, len(end) - 2))

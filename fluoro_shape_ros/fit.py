@@ -17,6 +17,8 @@ from .spline import Spline3, bending, prolong, through
 from .strips import Measurement, Strips, cut, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
 
 COARSE, FINE = 2, 3
+COARSE_STEP = 3         # px between the strips of a coarse round
+SETTLED_PX = 0.1        # a fine round that moves the curve less is the last
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
 NEAR_END_PX = 8
@@ -61,23 +63,25 @@ def fit(images, fields, views, points: np.ndarray, radius: float) -> Fit | None:
     rounds = [True] * COARSE + [False] * FINE
     while rounds:
         wide = rounds.pop(0)
-        s = np.arange(spline.start, spline.stop, step)
+        s = np.arange(spline.start, spline.stop, COARSE_STEP * step if wide else step)
         strips = _cut_both(images, fields, views, spline, s, half_width, WIDE_PX if wide else 0.0)
         within = (s >= reference[0]) & (s <= reference[1])
         if wide:
             seen = [_searched(t, shadow(h, np.arange(-half_width_range(h), half_width_range(h) + 1))) for t, h in zip(strips, half_width)]
-            spline = solve(spline, s, strips, seen, views, within)[0]
+            spline = solve(spline, s, strips, seen, views, within).spline
             continue
         expected = [shadow(h, t.offsets_px) for t, h in zip(strips, half_width)]
         profiles = [own_shadow(t, within & t.inside, e) for t, e in zip(strips, expected)]
         seen = [measure(t, p, within) for t, p in zip(strips, profiles)]
-        spline, covariance, offsets = solve(spline, s, strips, seen, views, within)
+        solution = solve(spline, s, strips, seen, views, within)
+        spline = solution.spline
         presence = np.stack([m.presence for m in seen], axis=1)
         stretch = supported(presence)
         if stretch is None:
             return None
+        settled = solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, (s[stretch[0]], s[stretch[1]]))).max() < 2 * step
         reference = (s[stretch[0]], s[stretch[1]])
-        if rounds or grown == GROWTH:
+        if (rounds and not settled) or grown == GROWTH:
             continue
         beyond = np.stack([_beyond(presence, stretch[0], -1), _beyond(presence, stretch[1], 1)])
         goes_on = [bool((b > GOES_ON).all()) for b in beyond]
@@ -87,40 +91,75 @@ def fit(images, fields, views, points: np.ndarray, radius: float) -> Fit | None:
             spline, shift = prolong(spline, goes_on, GROWTH_PX * step)
             reference = (reference[0] + shift - goes_on[0] * GROWTH_PX * step, reference[1] + shift + goes_on[1] * GROWTH_PX * step)
             rounds, grown = [True] + [False] * (FINE - 1), grown + 1
-    return _finish(spline, views, s, strips, seen, presence, offsets, covariance, reference, beyond, half_width, radius)
+    return _finish(solution, s, strips, seen, presence, reference, beyond, half_width, radius)
 
 
-def solve(spline: Spline3, s: np.ndarray, strips: list[Strips], seen: list[Measurement], views, within: np.ndarray) -> tuple[Spline3, np.ndarray, np.ndarray]:
-    """One Gauss-Newton step: the spline, its covariance (3 n, 3 n), and what remains of the (N, 2) offsets.
+@dataclass(frozen=True)
+class Solution:
+    """A spline after one step of the solver."""
+
+    spline: Spline3
+    information: np.ndarray     # (3 n, 3 n) 1/m^2 of the control points
+    offset_px: np.ndarray       # (N, 2) of the device from the curve, after the step; NaN where not measured
+    moved_px: float             # how far the step went, at most
+
+
+@dataclass(frozen=True)
+class Local:
+    """A tall matrix (N, 3 n) whose row i touches the twelve unknowns from 3 k[i] on: only those are kept. k ascends."""
+
+    k: np.ndarray       # (N,)
+    rows: np.ndarray    # (N, 12)
+    n: int              # control points
+
+    def normal(self, w: np.ndarray) -> np.ndarray:
+        """(3 n, 3 n) A^T diag(w) A."""
+        starts = np.nonzero(np.diff(self.k, prepend=-1))[0]
+        blocks = np.add.reduceat((self.rows * w[:, None])[:, :, None] * self.rows[:, None, :], starts)
+        at = 3 * self.k[starts][:, None] + np.arange(12)
+        H = np.zeros((3 * self.n, 3 * self.n))
+        np.add.at(H, (at[:, :, None], at[:, None, :]), blocks)
+        return H
+
+    def transposed(self, y: np.ndarray) -> np.ndarray:
+        """(3 n,) A^T y."""
+        return np.bincount((3 * self.k[:, None] + np.arange(12)).ravel(), (self.rows * y[:, None]).ravel(), 3 * self.n)
+
+    def __matmul__(self, x: np.ndarray) -> np.ndarray:
+        """(N,) A x."""
+        return np.einsum('ij,ij->i', self.rows, x[3 * self.k[:, None] + np.arange(12)])
+
+
+def solve(spline: Spline3, s: np.ndarray, strips: list[Strips], seen: list[Measurement], views, within: np.ndarray) -> Solution:
+    """One Gauss-Newton step.
 
     Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's biweight); prior: third
     differences of the control points. The Jacobian of a projection has rank 2, n picks what is seen across the curve.
     """
     n = len(spline.control)
-    B = spline.basis(s)
-    X = B @ spline.control
-    J = np.concatenate([np.einsum('ij,ijk->ik', t.normals, projection_jacobian(v.P, X)) for t, v in zip(strips, views)])    # (2 N, 3)
-    A = (np.concatenate([B, B])[:, :, None] * J[:, None, :]).reshape(len(J), 3 * n)
-    d = np.concatenate([m.offset_px for m in seen])
-    w0 = 1 / (REDUNDANCY * np.concatenate([m.variance for m in seen]) + MODEL_PX**2)
-    w0 = np.where(np.concatenate([within, within]), w0, 0.0)
-    spacing = (spline.stop - spline.start) / (n - 3)
-    D = np.kron(bending(n), np.eye(3)) / (BEND_SIGMA * spacing**3)
-    along = (B[::4, :, None] * spline(s[::4], 1)[:, None, :]).reshape(-1, 3 * n) / SLIDE
-    prior = D.T @ D + along.T @ along
+    k, b = spline.weights(s)
+    X = spline(s)
+    J = np.stack([np.einsum('ij,ijk->ik', t.normals, projection_jacobian(v.P, X)) for t, v in zip(strips, views)], axis=1)     # (N, 2, 3)
+    A = (b[:, None, :, None] * J[:, :, None, :]).reshape(-1, 12)            # each row touches four control points; rows stay sorted by k
+    rows = Local(np.repeat(k, 2), A, n)
+    d = np.stack([m.offset_px for m in seen], axis=1).ravel()
+    w0 = np.stack([1 / (REDUNDANCY * m.variance + MODEL_PX**2) for m in seen], axis=1) * within[:, None]
+    w0 = w0.ravel()
+    D = np.kron(bending(n), np.eye(3)) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
+    slide = Local(k[::4], (b[::4, :, None] * spline(s[::4], 1)[:, None, :]).reshape(-1, 12) / SLIDE, n)
+    prior = D.T @ D + slide.normal(np.ones(len(slide.k)))
     g0 = -D.T @ (D @ spline.control.ravel())
     w, used = w0, w0 > 0
-    for _ in range(4):
-        H = (A * w[:, None]).T @ A + prior
-        step = np.linalg.solve(H, A.T @ (w * d) + g0)
-        r = d - A @ step
+    for _ in range(3):
+        step = np.linalg.solve(rows.normal(w) + prior, rows.transposed(w * d) + g0)
+        r = d - rows @ step
         z = np.abs(r) * np.sqrt(w0)
         spread = max(1.0, 1.4826 * float(np.median(z[used]))) if used.any() else 1.0
         w = w0 * np.maximum(1 - (z / (5 * spread)) ** 2, 0) ** 2 / spread**2
-    together = np.repeat([_together((r * np.sqrt(w))[k], used[k]) for k in (slice(0, len(s)), slice(len(s), None))], len(s))
-    covariance = np.linalg.inv((A * (w / together)[:, None]).T @ A + prior)
-    offsets = np.where(used, r, np.nan).reshape(2, -1).T
-    return Spline3(spline.start, spline.stop, spline.control + step.reshape(n, 3)), covariance, offsets
+    together = np.array([_together((r * np.sqrt(w))[v::2], used[v::2]) for v in (0, 1)])
+    information = rows.normal((w.reshape(-1, 2) / together).ravel()) + prior
+    moved = Spline3(spline.start, spline.stop, spline.control + step.reshape(n, 3))
+    return Solution(moved, information, np.where(used, r, np.nan).reshape(-1, 2), float(np.abs(rows @ step)[used].max(initial=0.0)))
 
 
 def _together(z: np.ndarray, used: np.ndarray) -> float:
@@ -139,7 +178,7 @@ def _cut_both(images, fields, views, spline: Spline3, s: np.ndarray, half_width,
 
 def _searched(strips: Strips, profile: np.ndarray) -> Measurement:
     """The coarse measurement: where the darkest line lies in each wide strip, worth about a pixel."""
-    offset = search(strips, profile)
+    offset = search(strips, profile, smooth=3)
     return Measurement(offset, np.where(strips.inside, 1.0, np.inf), np.ones(len(offset)), 1.0)
 
 
@@ -149,7 +188,7 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.median(past, axis=0) if len(past) >= 10 else np.full(2, np.nan)
 
 
-def _finish(spline, views, s, strips, seen, presence, offsets, covariance, reference, beyond, half_width, radius) -> Fit:
+def _finish(solution: Solution, s, strips, seen, presence, reference, beyond, half_width, radius) -> Fit:
     speed = np.stack([t.speed for t in strips], axis=1)
     inside = np.stack([t.inside for t in strips], axis=1)
     sigma = np.array([m.presence_sigma for m in seen])
@@ -168,7 +207,8 @@ def _finish(spline, views, s, strips, seen, presence, offsets, covariance, refer
             continue
         i = min(i, len(s) - 1)
         ends[k], end_sigma[k] = locate(s, presence, sigma, speed, reference[k], outward, bulge(radius, speed[i], scale, across))
-    return Fit(spline, ends[0], ends[1], end_sigma, open_end, covariance, s, presence, offsets, across, alike, np.nan_to_num(beyond))
+    covariance = np.linalg.inv(solution.information)
+    return Fit(solution.spline, ends[0], ends[1], end_sigma, open_end, covariance, s, presence, solution.offset_px, across, alike, np.nan_to_num(beyond))
 
 
 def _contrast(profile: np.ndarray) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from .curve import arc_length, at_arc_length
 from .geometry import epipolar_lines
 
-SAMPLES = 72            # points a curve in the alignment
+SAMPLES = 64            # points a curve in the alignment
 TOLERANCE_PX = 3.0      # epipolar distance at which a point gains nothing
 WORST = -1.5            # the most a point costs, in lengths
 SHORTEST_PX = 60.0      # of both curves together

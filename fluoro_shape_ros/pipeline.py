@@ -111,7 +111,8 @@ def backbone(f: Fit, forward: bool, step: float) -> Shape:
     at = np.interp(s, along, u)
     points, basis = f.spline(at), f.spline.basis(at)
     n = len(f.spline.control)
-    covariance = np.einsum('in,namb,im->iab', basis, f.covariance.reshape(n, 3, n, 3), basis, optimize=True)
+    half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
+    covariance = np.einsum('iamb,im->iab', half, basis)
     tangent = f.spline(at[[0, -1]], 1)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     sigma = f.end_sigma if forward else f.end_sigma[::-1]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from .curve import arc_length, at_arc_length
 
 KNOT_SPACING = 0.008        # m: a device bends with radii of some cm
 MIN_CONTROL, MAX_CONTROL = 7, 48
+UNIFORM_CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6    # row p: coefficients of u^p of the four weights
 
 
 @dataclass(frozen=True)
@@ -21,16 +21,35 @@ class Spline3:
     stop: float
     control: np.ndarray     # (n, 3) m
 
-    def basis(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """(N, n) basis functions, or a derivative of them, at (N,) arc lengths; uniform knots, so that equal control point
-        steps are equal speed right to the ends."""
-        n = len(self.control)
-        knots = self.start + (np.arange(n + 4) - 3) * (self.stop - self.start) / (n - 3)
-        return BSpline(knots, np.eye(n), 3)(s, derivative)
+    def weights(self, s: np.ndarray, derivative: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) index of the first of the four control points that count at each arc length, and (N, 4) their weights (de Boor 1978, uniform cubic).
+
+        Knots are uniform, so that equal control point steps are equal speed right to the ends. Beyond them the outermost pieces go on.
+        """
+        pieces = len(self.control) - 3
+        h = (self.stop - self.start) / pieces
+        x = (np.asarray(s, float) - self.start) / h
+        k = np.clip(np.floor(x), 0, pieces - 1).astype(int)
+        u = x - k
+        powers = np.stack([_falling(p, derivative) * u ** max(p - derivative, 0) for p in range(4)], axis=1) / h**derivative
+        return k, powers @ UNIFORM_CUBIC
+
+    def basis(self, s: np.ndarray) -> np.ndarray:
+        """(N, n) basis functions at (N,) arc lengths."""
+        k, b = self.weights(s)
+        B = np.zeros((len(k), len(self.control)))
+        np.put_along_axis(B, k[:, None] + np.arange(4), b, axis=1)
+        return B
 
     def __call__(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
         """(N, 3) points, or derivatives."""
-        return self.basis(s, derivative) @ self.control
+        k, b = self.weights(s, derivative)
+        return np.einsum('ij,ijk->ik', b, self.control[k[:, None] + np.arange(4)])
+
+
+def _falling(p: int, d: int) -> float:
+    """p (p - 1) ... of d factors: the derivative's factor of u^p."""
+    return float(np.prod(np.arange(p - d + 1, p + 1))) if p >= d else 0.0
 
 
 def bending(n: int) -> np.ndarray:
