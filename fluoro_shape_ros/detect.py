@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from .centerline import Candidate, find_candidates, find_ridges, ridge_scale
 from .data import Outcome
-from .fit import Fit, fit, shown
+from .fit import Fit, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
 from .start import first_curve
@@ -106,7 +106,7 @@ def evidence(f: Fit) -> float:
     """How much speaks for a fit: a device looks like a cylinder of its radius, is seen all along and equally dark by both planes, and stops in both at once."""
     if f.contrast.min() <= 0:
         return 0.0
-    alike = np.exp(-0.5 * (np.log(f.contrast[0] / f.contrast[1]) / CONTRAST_RATIO) ** 2)
+    alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
     return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * np.exp((np.clip(f.likeness, 0, 1).mean() - 1) / UNLIKE))

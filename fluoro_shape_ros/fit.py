@@ -44,7 +44,8 @@ class Fit:
     s: np.ndarray               # (N,) m
     presence: np.ndarray        # (N, 2)
     offset_px: np.ndarray       # (N, 2) of the device from the fitted curve; NaN where not measured
-    contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, as if seen straight on, after blur
+    contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, after blur
+    across: np.ndarray          # (2,) the same as if seen straight on, by Beer-Lambert
     likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder of robot_radius
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
 
@@ -208,7 +209,7 @@ def _finish(solution: Solution, s, strips, seen, presence, reference, beyond, ha
         i = min(i, len(s) - 1)
         ends[k], end_sigma[k] = locate(s, presence, sigma, speed, reference[k], outward, bulge(radius, speed[i], scale, across))
     covariance = np.linalg.inv(solution.information)
-    return Fit(solution.spline, ends[0], ends[1], end_sigma, open_end, covariance, s, presence, solution.offset_px, across, alike, np.nan_to_num(beyond))
+    return Fit(solution.spline, ends[0], ends[1], end_sigma, open_end, covariance, s, presence, solution.offset_px, contrast, across, alike, np.nan_to_num(beyond))
 
 
 def _contrast(profile: np.ndarray) -> float:
@@ -220,3 +221,8 @@ def shown(f: Fit) -> np.ndarray:
     """(2,) share of the device's length that each plane shows."""
     between = (f.s > f.start) & (f.s < f.stop)
     return (np.nan_to_num(f.presence[between]) > 0.4).mean(axis=0) if between.any() else np.zeros(2)
+
+
+def contrast_ratio(f: Fit) -> float:
+    """How many times as dark one plane shows the device as the other, at least 1: as seen for an opaque device, as if straight on for a translucent one."""
+    return float(min(c.max() / max(c.min(), 1e-6) for c in (f.contrast, f.across)))

@@ -7,7 +7,7 @@ import numpy as np
 from .config import Config
 from .curve import curvature
 from .data import Outcome
-from .fit import Fit, shown
+from .fit import Fit, contrast_ratio, shown
 
 MIN_LIKENESS = 0.86     # correlation of the profile seen with a cylinder's of robot_radius, in the worse plane
 MAX_CONTRAST_RATIO = 2.0
@@ -23,7 +23,7 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
     if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
         return Outcome.POORLY_EXPLAINED, f'its profile is not that of a device of robot_radius (likeness {f.likeness[0]:.2f}, {f.likeness[1]:.2f})'
-    ratio = float(f.contrast.max() / f.contrast.min())
+    ratio = contrast_ratio(f)
     if ratio > MAX_CONTRAST_RATIO:
         return Outcome.DIRECTIONS_DISAGREE, f'one plane shows it {ratio:.1f} times as dark as the other'
     share = shown(f)
