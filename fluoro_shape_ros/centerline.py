@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -13,6 +14,8 @@ RIDGE_Z = 3.5           # ridge points stand out from the noise by this many sta
 BRANCH_Z = 5.0          # ... and branches by this, on average over their best half
 MAX_RIDGE_SHARE = 0.015 # of the pixels, at most: the strongest
 NMS_PX = 0.75           # a ridge point lies within this of its pixel's centre (0.5, and some for noise)
+KINK_PX = 6             # a branch that turns by more than this within so many points to either side is two lines that touch
+MAX_KINK = np.deg2rad(38)
 END_PX = 12             # length over which the direction of a branch's end is measured
 GAP_PX = 48.0           # longest gap that is bridged, where it is straight
 MAX_TURN = np.deg2rad(50)    # ... the direction may change by this over a short gap
@@ -109,8 +112,24 @@ def _branches(u, v, su, sv, z, shape) -> Ridges:
     order = order[alive[order]]
     if not len(order):
         return _no_ridges()
-    changes = np.nonzero(np.diff(label[order]))[0] + 1
-    return Ridges(np.c_[su, sv][order], z[order], np.concatenate([[0], changes, [len(order)]]))
+    return _split_at_kinks(np.c_[su, sv][order], z[order], label[order])
+
+
+def _split_at_kinks(points: np.ndarray, z: np.ndarray, label: np.ndarray) -> Ridges:
+    """Branches of (M, 2) points sorted by their (M,) label; where one turns sharply, two lines touch, and it is cut."""
+    k = KINK_PX
+    turn = np.zeros(len(label))
+    if len(label) > 2 * k:
+        before, after = points[k:-k] - points[:-2 * k], points[2 * k:] - points[k:-k]
+        cosine = (before * after).sum(axis=1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1) + 1e-9)
+        turn[k:-k] = np.where(label[:-2 * k] == label[2 * k:], np.arccos(np.clip(cosine, -1, 1)), 0)
+    sharp = maximum_filter1d((turn > MAX_KINK).astype(np.uint8), 3) > 0
+    cut = np.diff(label, prepend=label[0]) != 0
+    cut |= np.diff(sharp.astype(np.int8), prepend=0) != 0
+    piece, keep = np.cumsum(cut), ~sharp
+    points, z, piece = points[keep], z[keep], piece[keep]
+    changes = np.nonzero(np.diff(piece))[0] + 1
+    return Ridges(points, z, np.concatenate([[0], changes, [len(z)]]).astype(int))
 
 
 def _neighbour_pairs(u: np.ndarray, v: np.ndarray, shape) -> np.ndarray:
