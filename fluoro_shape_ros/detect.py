@@ -93,13 +93,17 @@ def candidates_of(image, field, half_width_px: float, min_length_px: float) -> l
 def explained(f: Fit, view, line_px: np.ndarray, visible: np.ndarray) -> float:
     """Share of an (N, 2) undistorted centreline that lies within EXPLAINED_PX of the fitted curve's projection.
 
-    Pieces beyond a gap in the line (`visible` (N,) false) that the curve has nothing to do with do not count: they may be another line.
+    Pieces beyond a gap in the line (`visible` (N,) false) that the curve has nothing to do with do not count: they may be another line. Nor does
+    what lies past an end where the device leaves the other plane's field.
     """
     projected = project(view.P, f.spline(np.arange(f.start, f.stop, f.s[1] - f.s[0])))
-    near = cKDTree(projected).query(line_px)[0] < EXPLAINED_PX
+    distance, nearest = cKDTree(projected).query(line_px)
+    near = distance < EXPLAINED_PX
+    elsewhere = ~near & (((nearest == 0) & f.open_end[0]) | ((nearest == len(projected) - 1) & f.open_end[1]))
     piece = np.cumsum(np.diff(visible.astype(int), prepend=1) == 1)
     share = np.bincount(piece, near) / np.bincount(piece)
-    return float(near[counted].mean()) if (counted := share[piece] > 0.2).any() else 0.0
+    counted = (share[piece] > 0.2) & ~elsewhere
+    return float(near[counted].mean()) if counted.any() else 0.0
 
 
 def evidence(f: Fit) -> float:

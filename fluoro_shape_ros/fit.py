@@ -26,7 +26,7 @@ GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how m
 GOES_ON = 0.25          # darkness beyond an end, as a share of the usual, that makes one look farther
 BEND_SIGMA = 3e-3 / 0.01**3     # 1/m^2: typical change of curvature along a device (third differences of 3 mm at control points 10 mm apart)
 SLIDE = 1e-4             # m: images do not see a curve slide along itself, so no step may
-MODEL_PX = 0.07         # what the model of a strip is worth, added to the noise
+MODEL_PX = 0.15         # what the model of a strip is worth (0.03 px, the same over some 25 strips), added to the noise
 BLOCK = 16              # strips over which errors that go together (anatomy, crossings) show
 REDUNDANCY = 1.3        # cubic interpolation correlates neighbouring strips
 

@@ -12,6 +12,10 @@ from .data import View
 from .geometry import distort, project
 
 
+TOGETHER = 25           # strips along which a structured background errs the same way
+MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
+
+
 @dataclass(frozen=True)
 class Strips:
     """Profiles across the projected curve in one plane."""
@@ -124,6 +128,9 @@ def measure(strips: Strips, profile: np.ndarray, reference: np.ndarray | None = 
     with np.errstate(invalid='ignore', divide='ignore'):
         offset = coefficients[:, 4] / usual
     variance = noise**2 * (fit[4] @ fit[4]) / np.maximum(usual, 1e-9) ** 2
+    # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
+    misfit = uniform_filter1d(np.minimum((rest**2).sum(axis=1) / (len(x) - 5), 9 * noise**2), TOGETHER) / noise**2
+    variance = variance * (1 + TOGETHER * np.maximum(misfit - MISFIT, 0))
     odd = np.minimum(rest**2, 9 * noise**2).mean(axis=1) > 3.5 * noise**2   # another edge runs through: not to be trusted
     variance = np.where(inside & ~odd, variance, np.inf)
     sigma = noise * np.linalg.norm(fit[3]) / np.nanmedian(usual) if np.isfinite(usual).any() else np.inf
