@@ -8,7 +8,6 @@ from functools import lru_cache, partial
 
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -20,11 +19,12 @@ from std_srvs.srv import SetBool, Trigger
 from msg_adapters.cameras import BadCameraInfo
 from msg_adapters.diagnostics import Tally, diagnostic_array, pairing_status, plane_status, reconstruction_status
 from msg_adapters.messages import ros_message, stamp_ns
-from msg_adapters.shapes import BadPath, path_to_points, shape_to_path, shape_to_tip
+from msg_adapters.shapes import BadPath, path_to_points
 
 from . import params
 from .config import ConfigError
 from .data import Frame, Outcome, Reconstruction
+from .outputs import Outputs
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
 from .subscriptions import AdaptiveSubscription, transform_lookup
@@ -49,9 +49,7 @@ class FluoroShapeNode(Node):
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
 
         overridable = QoSOverridingOptions.with_default_policies()
-        latest = QoSProfile(depth=1)    # reliable
-        self._path_out = self.create_publisher(Path, 'backbone', latest, qos_overriding_options=overridable)
-        self._tip_out = self.create_publisher(PointStamped, 'tip', latest, qos_overriding_options=overridable)
+        self._outputs = Outputs(self)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10), qos_overriding_options=overridable)
         self._answered = self.create_guard_condition(self._report_changes)
         self._worker = Worker(self._work, self._failed)
@@ -120,7 +118,7 @@ class FluoroShapeNode(Node):
         book, known = self._books[plane], camera(msg)
         try:
             if known != book.newest:
-                known = checked_camera(msg, self._config)
+                known = checked_camera(msg, self._config, plane)
         except BadCameraInfo as error:
             self._tally.refused(f'camera info {plane}', str(error))
             self._report_changes()
@@ -214,11 +212,13 @@ class FluoroShapeNode(Node):
         if job.config.input.threads != self._threads:
             self._threads = job.config.input.threads
             cv2.setNumThreads(self._threads or -1)      # 0 would mean none for OpenCV
-        frame = adapt(job, self._view_of, self._lookup, self._tally)
-        result = frame if isinstance(frame, Reconstruction) else self._reconstruct(job, frame)
+        adapted = adapt(job, self._view_of, self._lookup, self._tally)
+        frame, result = (None, adapted) if isinstance(adapted, Reconstruction) else (adapted, self._reconstruct(job, adapted))
         if result is not None:
             self._tally.result(result, time.monotonic() - job.arrived)
         self._answered.trigger()
+        if result is not None:
+            self._outputs.explain(job, frame, result)
 
     def _reconstruct(self, job: Job, frame: Frame) -> Reconstruction | None:
         """The published answer to a frame; None where it went into the mask or was overtaken by a reset."""
@@ -228,9 +228,7 @@ class FluoroShapeNode(Node):
         result = reconstruct(frame, job.config, self._memory.prior(job, frame, window, self._tally))
         if not self._memory.remember(job, frame, result):
             return None
-        if result.shape is not None:
-            self._path_out.publish(shape_to_path(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
-            self._tip_out.publish(shape_to_tip(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
+        self._outputs.answer(frame, result)
         return result
 
     def _failed(self, job: Job, error: Exception) -> None:

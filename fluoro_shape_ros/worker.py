@@ -41,11 +41,11 @@ def camera(msg) -> Camera:
     return Camera((*content, msg.binning_x, msg.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height), msg)
 
 
-def checked_camera(msg, config: Config) -> Camera:
-    """The camera of a CameraInfo that may serve once an image of its size comes. Raises BadCameraInfo."""
+def checked_camera(msg, config: Config, plane: str = '') -> Camera:
+    """The camera of a plane's CameraInfo that may serve once an image of its size comes. Raises BadCameraInfo."""
     region = [(r or full) // max(b, 1) for r, full, b in zip((msg.roi.height, msg.roi.width), (msg.height, msg.width), (msg.binning_y, msg.binning_x))]
     pose = (np.eye(3), np.zeros(3)) if config.input.geometry == 'tf' else None
-    camera_info_to_view(msg, '', tuple(region), rectified=config.input.rectified, pose=pose)
+    camera_info_to_view(msg, plane, tuple(region), rectified=config.input.rectified, pose=pose)
     return camera(msg)
 
 
@@ -69,6 +69,12 @@ class Job:
     arrived: float                          # time.monotonic() when the second image came
     prediction: Prediction | None = None
 
+    @property
+    def frame_id(self) -> str:
+        """The reference frame; empty where it is to be plane A's and that is not known."""
+        first = self.cameras[0]
+        return self.config.input.reference_frame or ('' if first is None else first.msg.header.frame_id)
+
 
 ViewOf = Callable[..., View]        # (camera, plane, image_shape, rectified, pose) -> View
 Lookup = Callable[[str, str, int], tuple]   # (reference frame, camera frame, stamp_ns) -> camera_from_reference, raises NoTransform
@@ -80,12 +86,17 @@ def view_of(camera: Camera, plane: str, image_shape: tuple[int, int], rectified:
     return camera_info_to_view(camera.msg, plane, image_shape, rectified=rectified, pose=pose)
 
 
+def decode(msg) -> np.ndarray:
+    """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage. Raises BadImage."""
+    return image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg)
+
+
 def adapt(job: Job, view_of: ViewOf, lookup: Lookup, tally: Tally) -> Frame | Reconstruction:
     """The Frame of a pair of messages, or the rejection that says why it can't be one."""
     images, faults = [], []
     for plane, msg in zip(PLANES, job.images):
         try:
-            images.append(image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg))
+            images.append(decode(msg))
             tally.accepted(f'image {plane}')
         except BadImage as error:
             faults.append(f'plane {plane}: {error}')
@@ -96,15 +107,14 @@ def adapt(job: Job, view_of: ViewOf, lookup: Lookup, tally: Tally) -> Frame | Re
     if missing:
         return Reconstruction(Outcome.NO_CAMERA_INFO, f'{" and ".join(missing)}: no valid camera info yet')
     given = job.config.input
-    reference = given.reference_frame or job.cameras[0].msg.header.frame_id
     try:
-        poses = [lookup(reference, c.msg.header.frame_id, job.stamp_ns) if given.geometry == 'tf' else None for c in job.cameras]
+        poses = [lookup(job.frame_id, c.msg.header.frame_id, job.stamp_ns) if given.geometry == 'tf' else None for c in job.cameras]
         views = tuple(view_of(c, plane, image.shape, given.rectified, pose) for c, plane, image, pose in zip(job.cameras, PLANES, images, poses))
     except NoTransform as error:
         return Reconstruction(Outcome.NO_TRANSFORM, str(error))
     except BadCameraInfo as error:
         return Reconstruction(Outcome.BAD_CAMERA_INFO, str(error))
-    return Frame(job.stamp_ns, reference, tuple(images), views)
+    return Frame(job.stamp_ns, job.frame_id, tuple(images), views)
 
 
 class Memory:
@@ -155,9 +165,20 @@ class Memory:
                 total += image
             self._taken += 1
             if self._taken == self._wanted:
-                self._masks = tuple((total / self._taken).astype(np.float32) for total in self._sums)
-                self._sums, self._wanted = None, 0
+                self._finish_mask()
             return True
+
+    def finish_mask(self) -> int:
+        """Let what was captured so far be the mask, if anything was; the number of its pairs."""
+        with self._lock:
+            if self._wanted and self._taken:
+                self._finish_mask()
+            self._wanted = 0
+            return self._taken
+
+    def _finish_mask(self) -> None:
+        self._masks = tuple((total / self._taken).astype(np.float32) for total in self._sums)
+        self._sums, self._wanted = None, 0
 
     def prior(self, job: Job, frame: Frame, window: tuple, tally: Tally) -> Prior:
         """What is known before `frame` is looked at. A mask that no longer fits the images is dropped."""

@@ -72,24 +72,9 @@ class Run:
         images = tuple(self._image(whole, i, rng) for i in (0, 1))
         return Frame(stamp_ns, FRAME_ID, images, tuple(f.view for f in self.fields))
 
-    def expected(self, whole: np.ndarray | None, i: int, shift_px: tuple[float, float] = (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) float32 each: plane `i`'s blurred image before noise, as a share of full scale (P) or of the open beam (X-ray), and the
-        variance of the noise that each pixel gets; the device's shadow is moved by `shift_px` (u, v)."""
-        sharp = self._sharp(whole, i, shift_px)
-        if self.exposure is None:
-            return cv2.GaussianBlur(sharp, (5, 5), 0), np.full_like(sharp, NOISE_VARIANCE)     # as vtk_scene.degrade blurs
-        beam = xray.blurred(sharp, self.exposure)
-        return beam, beam / np.float32(self.exposure.photons)
-
-    def _image(self, whole: np.ndarray | None, i: int, rng: np.random.Generator) -> np.ndarray:
-        sharp = self._sharp(whole, i)
-        if self.exposure is None:
-            return vtk_scene.degrade(sharp, rng, NOISE_VARIANCE)
-        image = xray.expose(sharp, self.exposure, rng)
-        return surroundings.burn_in(image) if self.text else image
-
-    def _sharp(self, whole: np.ndarray | None, i: int, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-        """(H, W) float32: grey levels (P) or the transmitted beam (X-ray) in plane `i`, before blur and noise."""
+    def sharp(self, whole: np.ndarray | None, i: int, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+        """(H, W) float32: plane `i` before blur and noise, as a share of full scale (P) or of the open beam (X-ray); the device's shadow is
+        moved by `shift_px` (u, v)."""
         view = self.fields[i].view
         view = dataclasses.replace(view, P=view.P + np.outer([*shift_px, 0.0], view.P[2]))      # moves the principal point
         bare = np.ones((view.height, view.width), np.float32)
@@ -97,6 +82,21 @@ class Run:
             return bare * np.float32(BACKGROUND) if whole is None else grey(whole, self.radius, view, self.renderer)
         beam = bare if whole is None else xray.transmission(whole, self.radius, view, self.exposure)
         return beam if self.beams is None else beam * self.beams[i]
+
+    def blurred(self, sharp: np.ndarray) -> np.ndarray:
+        """The (H, W) image as `scene` blurs it."""
+        return cv2.GaussianBlur(sharp, (5, 5), 0) if self.exposure is None else xray.blurred(sharp, self.exposure)
+
+    def noise_variance(self, blurred: np.ndarray) -> np.ndarray:
+        """(H, W) float32: of the noise that `scene` adds to each pixel of a `blurred` image."""
+        return np.full_like(blurred, NOISE_VARIANCE) if self.exposure is None else blurred / np.float32(self.exposure.photons)
+
+    def _image(self, whole: np.ndarray | None, i: int, rng: np.random.Generator) -> np.ndarray:
+        sharp = self.sharp(whole, i)
+        if self.exposure is None:
+            return vtk_scene.degrade(sharp, rng, NOISE_VARIANCE)
+        image = xray.expose(sharp, self.exposure, rng)
+        return surroundings.burn_in(image) if self.text else image
 
 
 def grey(backbone: np.ndarray, radius: float, view: View, renderer: str) -> np.ndarray:
