@@ -180,7 +180,7 @@ def _strong_branches(ridges: Ridges) -> list[tuple[np.ndarray, np.ndarray]]:
     mean = np.add.reduceat(ridges.z, ridges.start[:-1]) / length
     excess = (mean - RIDGE_Z) * np.sqrt(length)
     good = np.nonzero((length >= 5) & (mean > BRANCH_Z) & (excess > 8.0))[0]
-    good = good[np.argsort(-(mean * length)[good])][:150]
+    good = good[np.argsort(-(mean * length)[good])][:90]
     return [(ridges.points_px[ridges.start[b]:ridges.start[b + 1]], ridges.z[ridges.start[b]:ridges.start[b + 1]]) for b in good]
 
 

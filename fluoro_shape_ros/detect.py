@@ -16,7 +16,7 @@ from .matching import align
 from .start import first_curve
 from .strips import cut_along, half_width_range, likeness, mean_profile
 
-LINES = 24              # strongest lines of an image that are looked at closely
+LINES = 14              # strongest lines of an image that are looked at closely
 CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...
 HOPELESS = 0.03         # ... unless they are that much less like it than the best
 HYPOTHESES = 4          # alignments that are fitted before one is chosen
@@ -71,7 +71,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
 
 def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
-    fitted = fit(images, fields, views, points, radius)
+    fitted = fit(images, fields, views, points, radius, coarse=1)
     if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start):
         return None
     ends = np.linspace(fitted.start, fitted.stop, 100)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 
-def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: np.ndarray, base_position=(), previous: np.ndarray | None = None) -> tuple[bool, bool]:
+def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Callable[[], np.ndarray], base_position=(),
+                previous: np.ndarray | None = None) -> tuple[bool, bool]:
     """Whether the last of a device's two ends is the tip, and whether that is a guess.
 
-    ends: (2, 3) first and last point, m. at_border: whether each lies at the field's border in a plane. border_px: (2, 2)
-    distance of each end (row) from the nearest border in each plane (column). base_position: where the device enters, m, or
+    ends: (2, 3) first and last point, m. at_border: whether each lies at the field's border in a plane. border_px: called only when all else
+    fails, gives the (2, 2) distance of each end (row) from the nearest border in each plane (column). base_position: where the device enters, m, or
     empty. previous: (N, 3) the last result, base to tip, m.
     """
     first, last = at_border
@@ -23,5 +26,5 @@ def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: np.nd
         swapped = np.linalg.norm(ends[1] - previous[0]) + np.linalg.norm(ends[0] - previous[-1])
         return bool(same <= swapped), False
     # farther from the border in both planes; where the planes contradict each other the nearer border of both decides
-    nearest = border_px.min(axis=1)
+    nearest = border_px().min(axis=1)
     return bool(nearest[1] >= nearest[0]), True

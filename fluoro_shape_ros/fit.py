@@ -50,10 +50,10 @@ class Fit:
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
 
 
-def fit(images, fields, views, points: np.ndarray, radius: float) -> Fit | None:
+def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = COARSE) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
-    images, fields: (H, W) float32 (dark device) and uint8, a pair each. radius: of the device, m.
+    images, fields: (H, W) float32 (dark device) and uint8, a pair each. radius: of the device, m. coarse: rounds that search for it a few px around.
     """
     scale = [pixels_per_metre(v.P, points) for v in views]
     half_width = [radius * k for k in scale]
@@ -61,7 +61,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float) -> Fit | None:
     spline = through(points, EXTENSION_PX * step)
     reference = (0.0, arc_length(points)[-1])
     grown, length_px = 0, 0.0
-    rounds = [True] * COARSE + [False] * FINE
+    rounds = [True] * coarse + [False] * FINE
     while rounds:
         wide = rounds.pop(0)
         s = np.arange(spline.start, spline.stop, COARSE_STEP * step if wide else step)
@@ -114,12 +114,17 @@ class Local:
     n: int              # control points
 
     def normal(self, w: np.ndarray) -> np.ndarray:
-        """(3 n, 3 n) A^T diag(w) A."""
-        starts = np.nonzero(np.diff(self.k, prepend=-1))[0]
-        blocks = np.add.reduceat((self.rows * w[:, None])[:, :, None] * self.rows[:, None, :], starts)
-        at = 3 * self.k[starts][:, None] + np.arange(12)
+        """(3 n, 3 n) A^T diag(w) A: a product a piece of the spline, each padded to the same number of rows, all at once."""
+        starts = np.searchsorted(self.k, np.arange(self.n - 3))
+        counts = np.diff(np.append(starts, len(self.k)))
+        at = starts[:, None] + np.arange(counts.max())
+        there = np.arange(counts.max()) < counts[:, None]
+        at = np.where(there, at, 0)
+        rows = self.rows[at]
+        blocks = rows.transpose(0, 2, 1) @ (rows * np.where(there, w[at], 0)[:, :, None])
         H = np.zeros((3 * self.n, 3 * self.n))
-        np.add.at(H, (at[:, :, None], at[:, None, :]), blocks)
+        for piece, block in enumerate(blocks):      # some 20 pieces, each overlaps the next in three control points
+            H[3 * piece:3 * piece + 12, 3 * piece:3 * piece + 12] += block
         return H
 
     def transposed(self, y: np.ndarray) -> np.ndarray:

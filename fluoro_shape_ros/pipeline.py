@@ -20,6 +20,7 @@ from .geometry import GeometryError, check_pair, distort, pixels_per_metre, proj
 from .mask import subtract
 from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
 
+REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 
 
@@ -30,9 +31,8 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
         check_pair(frame.views)
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
-    fields = tuple(field_of_view(image) for image in frame.images)
     images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
-    images = tuple(dark_device(image, config.detection.polarity) for image in images)
+    fields = tuple(field_of_view(image) for image in frame.images)
     clock.lap('prepare')
     by = _by_paper if config.curve.method == 'paper' else _by_spline
     return by(frame, images, fields, config, prior, clock)
@@ -40,14 +40,14 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
 
 def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, clock: _Stopwatch) -> Reconstruction:
     """method:=spline: both images are fitted at once, from where the device was or from a search of the whole images."""
-    images = tuple(cv2.sqrt(np.maximum(image, 0)) for image in images)     # Anscombe: quantum noise gets the same variance everywhere
-    radius = config.detection.robot_radius
+    radius, polarity = config.detection.robot_radius, config.detection.polarity
     found = None
     if config.curve.tracking and prior.previous is not None:
-        found = track(images, fields, frame.views, radius, prior.previous.points)
+        around = [region_around(v, prior.previous.points) for v in frame.views]
+        found = track([stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, radius, prior.previous.points)
         clock.lap('track')
     if found is None:
-        found = detect(images, fields, frame.views, radius, config.detection.min_length_px)
+        found = detect([stable_noise(i, polarity) for i in images], fields, frame.views, radius, config.detection.min_length_px)
         clock.lap('detect')
     seen = tuple(None if px is None else Centerline(px) for px in found.seen_px)
     if found.fit is None:
@@ -69,6 +69,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, clock
 
 def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, clock: _Stopwatch) -> Reconstruction:
     """method:=paper: segment each image, correspond, triangulate, and believe eq. 3."""
+    images = [dark_device(image, config.detection.polarity) for image in images]
     widths = paper.half_width_px(frame.views, config)
     seen = tuple(_centerline(paper.segment(image, width, config.detection.min_length_px), field, width)
                  for image, field, width in zip(images, fields, widths))
@@ -133,6 +134,26 @@ def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
     return float(image.max()) - image if polarity == 'bright' else image
 
 
+def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] = (slice(None), slice(None))) -> np.ndarray:
+    """(H, W) float32 square root of a dark device's image: quantum noise gets the same variance everywhere (Anscombe). 0 outside `region`."""
+    if region == (slice(None), slice(None)):
+        return cv2.sqrt(np.maximum(dark_device(image, polarity), 0))
+    out = np.zeros(image.shape, np.float32)
+    if polarity != 'dark':      # needs the whole image's statistics
+        out[region] = np.sqrt(np.maximum(dark_device(image, polarity)[region], 0))
+    else:
+        out[region] = np.sqrt(np.maximum(image[region].astype(np.float32), 0))
+    return out
+
+
+def region_around(view, points: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of the image within REGION_PX of the projections of (N, 3) points."""
+    uv = distort(view, project(view.P, points))
+    low = np.clip(np.floor(uv.min(axis=0)) - REGION_PX, 0, [view.width - 1, view.height - 1]).astype(int)
+    high = np.clip(np.ceil(uv.max(axis=0)) + REGION_PX, 1, [view.width, view.height]).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
 def residuals_px(points: np.ndarray, views, centerlines) -> np.ndarray:
     """(N, 2) distance in px of the reprojected (N, 3) points to the centreline seen in each plane."""
     return np.stack([_distance_to_polyline(project(v.P, points), undistort(v, line.points_px)) for v, line in zip(views, centerlines)], axis=1)
@@ -165,7 +186,8 @@ def _at_border(ends: np.ndarray, views, seen) -> tuple[bool, bool]:
 
 def _tip_rule(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, prior: Prior) -> tuple[bool, bool]:
     """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
-    border_px = np.stack([border_distance(f, distort(v, project(v.P, ends))) for f, v in zip(fields, views)], axis=1)
+    def border_px() -> np.ndarray:
+        return np.stack([border_distance(f, distort(v, project(v.P, ends))) for f, v in zip(fields, views)], axis=1)
     previous = prior.previous.points if prior.previous is not None else None
     return tip_is_last(ends, at_border, border_px, config.curve.base_position, previous)
 

@@ -55,11 +55,11 @@ def cut(image: np.ndarray, field: np.ndarray, view: View, points: np.ndarray, ta
 
 
 def cut_along(image: np.ndarray, field: np.ndarray, points_px: np.ndarray, reach_px: float) -> Strips:
-    """Strips across an (N, 2) line of image pixels about a pixel apart, every other one."""
+    """Strips across an (N, 2) line of image pixels about a pixel apart, at every third."""
     smooth = uniform_filter1d(points_px, 9, axis=0, mode='nearest')
-    tangent = np.gradient(smooth, axis=0)[::2]
+    tangent = np.gradient(smooth, axis=0)[::3]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
-    centers = smooth[::2]
+    centers = smooth[::3]
     return _sample(image, field, None, centers, np.c_[-tangent[:, 1], tangent[:, 0]], np.ones(len(centers)), reach_px)
 
 
