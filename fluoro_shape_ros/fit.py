@@ -68,7 +68,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         strips = _cut_both(images, fields, views, spline, s, half_width, WIDE_PX if wide else 0.0)
         within = (s >= reference[0]) & (s <= reference[1])
         if wide:
-            seen = [_searched(t, shadow(h, np.arange(-half_width_range(h), half_width_range(h) + 1))) for t, h in zip(strips, half_width)]
+            seen = [search(t, shadow(h, np.arange(-half_width_range(h), half_width_range(h) + 1)), smooth=3) for t, h in zip(strips, half_width)]
             spline = solve(spline, s, strips, seen, views, within).spline
             continue
         expected = [shadow(h, t.offsets_px) for t, h in zip(strips, half_width)]
@@ -182,12 +182,6 @@ def _cut_both(images, fields, views, spline: Spline3, s: np.ndarray, half_width,
     return [cut(image, field, v, X, T, half_width_range(h) + extra) for image, field, v, h in zip(images, fields, views, half_width)]
 
 
-def _searched(strips: Strips, profile: np.ndarray) -> Measurement:
-    """The coarse measurement: where the darkest line lies in each wide strip, worth about a pixel."""
-    offset = search(strips, profile, smooth=3)
-    return Measurement(offset, np.where(strips.inside, 1.0, np.inf), np.ones(len(offset)), 1.0)
-
-
 def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     """(2,) darkness that each plane shows just past strip `at`, as a share of the device's; NaN where that lies outside its field or the strips."""
     past = presence[at + 5:at + 22] if outward > 0 else presence[max(at - 21, 0):max(at - 4, 0)]
@@ -197,6 +191,7 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
 def _finish(solution: Solution, s, strips, seen, presence, reference, beyond, half_width, radius) -> Fit:
     speed = np.stack([t.speed for t in strips], axis=1)
     inside = np.stack([t.inside for t in strips], axis=1)
+    lit = np.stack([t.lit for t in strips], axis=1).all(axis=1)
     sigma = np.array([m.presence_sigma for m in seen])
     between = (s > reference[0]) & (s < reference[1])
     profile = [mean_profile(t, between) for t in strips]
@@ -206,12 +201,13 @@ def _finish(solution: Solution, s, strips, seen, presence, reference, beyond, ha
     alike = np.array([likeness(p, h) for p, h in zip(profile, half_width)])
     ends, end_sigma, open_end = list(reference), np.zeros(2), np.zeros(2, bool)
     for k, outward in enumerate((-1, 1)):
-        i = int(np.searchsorted(s, reference[k]))
+        i = min(int(np.searchsorted(s, reference[k])), len(s) - 1)
         past = inside[i:i + 14] if outward > 0 else inside[max(i - 14, 0):i + 1]
         if not past.all():    # it runs out of a field before its end could be seen
             open_end[k] = True
+            dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
+            ends[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
             continue
-        i = min(i, len(s) - 1)
         ends[k], end_sigma[k] = locate(s, presence, sigma, speed, reference[k], outward, bulge(radius, speed[i], scale, across))
     covariance = np.linalg.inv(solution.information)
     return Fit(solution.spline, ends[0], ends[1], end_sigma, open_end, covariance, s, presence, solution.offset_px, contrast, across, alike, np.nan_to_num(beyond))

@@ -26,6 +26,7 @@ class Strips:
     profiles: np.ndarray    # (N, W) image values at offsets
     offsets_px: np.ndarray  # (W,)
     inside: np.ndarray      # (N,) bool: the whole strip lies in the exposed field
+    lit: np.ndarray         # (N,) bool: its middle does
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,9 @@ def _sample(image, field, view: View | None, centers, normals, speed, reach_px: 
         at = distort(view, at.reshape(-1, 2)).reshape(at.shape)
     at = at.astype(np.float32)
     profiles = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    exposed = cv2.remap(field, at[:, [0, -1], 0], at[:, [0, -1], 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return Strips(centers, normals, speed, profiles, x, (exposed > 0).all(axis=1))
+    ends = [0, len(x) // 2, -1]
+    exposed = cv2.remap(field, at[:, ends, 0], at[:, ends, 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return Strips(centers, normals, speed, profiles, x, (exposed > 0).all(axis=1), exposed[:, 1] > 0)
 
 
 def likeness(profile: np.ndarray, half_width_px: float) -> float:
@@ -137,14 +139,20 @@ def measure(strips: Strips, profile: np.ndarray, reference: np.ndarray | None = 
     return Measurement(np.nan_to_num(offset), variance, np.where(inside, darkness / usual, np.nan), float(sigma))
 
 
-def search(strips: Strips, profile: np.ndarray, smooth: int = 9) -> np.ndarray:
-    """(N,) offset in px of the darkest line that fits `profile` (narrower than the strips), smoothed over `smooth` strips: a start within a few px."""
+def search(strips: Strips, profile: np.ndarray, smooth: int = 9) -> Measurement:
+    """Where the darkest line that fits `profile` (narrower than the strips) lies in each, averaged over `smooth` strips: a start within a few px.
+
+    Worth about a pixel; worth nothing where the line found is much fainter or darker than it usually is: there something hides the device.
+    """
     half = (len(profile) - 1) // 2
     kernel = profile - profile.mean()
     response = -cv2.filter2D(strips.profiles, cv2.CV_32F, kernel[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
     response = cv2.blur(response, (1, smooth))[:, half // 2: -(half // 2) or None]
     x = strips.offsets_px[half // 2: -(half // 2) or None]
-    return x[np.argmax(response, axis=1)]
+    best = np.argmax(response, axis=1)
+    strength = response[np.arange(len(best)), best] / max(float(np.median(response.max(axis=1)[strips.inside])) if strips.inside.any() else 1.0, 1e-9)
+    believed = strips.inside & (strength > 0.4) & (strength < 2.5)
+    return Measurement(x[best], np.where(believed, 1.0, np.inf), strength, 1.0)
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:
