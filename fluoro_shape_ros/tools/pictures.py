@@ -74,7 +74,7 @@ def save(out: Path, snapshot: Snapshot | None, history: History, caption: str) -
             sheet(f'overlay_{plane}', (9, 9), lambda f, i=i: overlay(f.add_axes((0, 0, 1, 1)), snapshot, i))
         sheet('backbone', (9, 8), lambda f: backbone(f.add_axes((0.0, 0.11, 0.98, 0.88), projection='3d'), f.add_axes((0.25, 0.07, 0.5, 0.02)), snapshot))
         sheet('demo', (14, 9.4), lambda f: everything(f, snapshot, history, caption))
-    sheet('errors', (10, 4), lambda f: errors(f.add_axes((0.07, 0.14, 0.91, 0.82)), history))
+    sheet('errors', (10, 4), lambda f: errors(f.add_axes((0.08, 0.14, 0.90, 0.82)), history))
     return saved
 
 
@@ -84,7 +84,7 @@ def everything(figure, snapshot: Snapshot, history: History, caption: str) -> No
     for i in (0, 1):
         overlay(figure.add_axes((0.01 + 0.325 * i, 0.44, 0.32, 0.32 * 14 / 9.4)), snapshot, i)
     backbone(figure.add_axes((0.655, 0.475, 0.315, 0.455), projection='3d'), figure.add_axes((0.73, 0.465, 0.2, 0.012)), snapshot)
-    errors(figure.add_axes((0.05, 0.075, 0.935, 0.29)), history)
+    errors(figure.add_axes((0.06, 0.075, 0.925, 0.29)), history)
 
 
 def overlay(ax, snapshot: Snapshot, plane: int) -> None:
