@@ -70,7 +70,7 @@ def test_bound_of_a_rod():
     t = np.linspace(-1, 1, 2001)
     K = sum((2 * k + 1) * np.polynomial.Legendre.basis(k)(t)**2 for k in range(4)) / (sideways * LENGTH)
     assert_allclose(found.mean, np.sqrt(np.pi * K / 2).mean(), rtol=0.06)     # blurred ends tell a little less
-    assert_allclose(found.tip, np.sqrt(2 * 16 / (sideways * LENGTH) + 1 / tip), rtol=0.03)
+    assert_allclose(found.tip, np.sqrt(2 * 16 / (sideways * LENGTH) + 1 / tip), rtol=0.06)
     assert_allclose(found.length, np.sqrt(2 / tip), rtol=0.02)
 
 

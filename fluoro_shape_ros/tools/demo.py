@@ -40,10 +40,10 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('--seconds', type=_positive, default=20.0, metavar='S', help='how long')
     add('--rate', type=_positive, default=5.0, metavar='HZ', help='pairs a second')
-    add('--seed', type=int, default=5, help='another seed is another device')
+    add('--seed', type=int, default=9, help='another seed is another device')
     add('--method', choices=method.metadata['choices'], default=method.default, help='parameter of the node')
     add('--renderer', choices=('xray', 'vtk'), default='xray', help='X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011')
-    add('--anatomy', action='store_true', help='ribs and spine behind the device (xray only); the method `paper` takes them for devices')
+    add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine (xray only); the method `paper` needs it')
     add('--out', type=Path, default=Path('fluoro_shape_demo'), metavar='FOLDER', help='pictures and logs go there')
     add('--domain', type=int, default=47, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     return parser
@@ -96,7 +96,7 @@ def commands(args) -> dict[str, list[str]]:
     # an active cannula whose shaft comes in through the border, so that the free end is known to be the tip; 0.3 mm a pixel at the isocentre
     device = ['--shape', 'cannula', '--length', '0.14', '0.188', '--moving', '--entering', '--pixel-size', '0.00044']
     sim = ['--seed', str(args.seed), '--rate', str(args.rate), '--renderer', args.renderer, '--prerender', str(RENDERED), '--wait', str(STARTUP_S)]
-    if not args.anatomy:
+    if args.no_anatomy:
         sim.append('--no-anatomy')
     return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}'],
             'sim': ['-m', 'fluoro_shape_ros.tools.sim', *sim, *device, '--reference-frame', FRAME]}

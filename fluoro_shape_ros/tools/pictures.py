@@ -8,16 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ..curve import arc_length, at_arc_length
 from ..geometry import pixels_per_metre, project
+from ..overlay import FOUND, TIP, free_corner, grey_levels
 from .cli import need
 
 GROUND, TEXT, GRID = '#12161c', '#d8dee6', '#39424e'
-FOUND, TRUTH, TIP, MISSED = '#2ad4ff', '#ffffff', '#ff5a5f', '#ffb347'
+TRUTH, MISSED = '#ffffff', '#ffb347'
 STYLE = {'figure.facecolor': GROUND, 'savefig.facecolor': GROUND, 'axes.facecolor': GROUND, 'axes.edgecolor': GRID, 'axes.labelcolor': TEXT, 'text.color': TEXT,
          'xtick.color': TEXT, 'ytick.color': TEXT, 'grid.color': GRID, 'grid.linewidth': 0.6, 'legend.facecolor': GROUND, 'legend.edgecolor': GRID}
 NAMES = ('overlay_a', 'overlay_b', 'backbone', 'demo', 'errors')
@@ -74,7 +74,7 @@ def save(out: Path, snapshot: Snapshot | None, history: History, caption: str) -
             sheet(f'overlay_{plane}', (9, 9), lambda f, i=i: overlay(f.add_axes((0, 0, 1, 1)), snapshot, i))
         sheet('backbone', (9, 8), lambda f: backbone(f.add_axes((0.0, 0.11, 0.98, 0.88), projection='3d'), f.add_axes((0.25, 0.07, 0.5, 0.02)), snapshot))
         sheet('demo', (14, 9.4), lambda f: everything(f, snapshot, history, caption))
-    sheet('errors', (10, 4), lambda f: errors(f.add_axes((0.07, 0.14, 0.91, 0.82)), history))
+    sheet('errors', (10, 4), lambda f: errors(f.add_axes((0.08, 0.14, 0.90, 0.82)), history))
     return saved
 
 
@@ -84,7 +84,7 @@ def everything(figure, snapshot: Snapshot, history: History, caption: str) -> No
     for i in (0, 1):
         overlay(figure.add_axes((0.01 + 0.325 * i, 0.44, 0.32, 0.32 * 14 / 9.4)), snapshot, i)
     backbone(figure.add_axes((0.655, 0.475, 0.315, 0.455), projection='3d'), figure.add_axes((0.73, 0.465, 0.2, 0.012)), snapshot)
-    errors(figure.add_axes((0.05, 0.075, 0.935, 0.29)), history)
+    errors(figure.add_axes((0.06, 0.075, 0.925, 0.29)), history)
 
 
 def overlay(ax, snapshot: Snapshot, plane: int) -> None:
@@ -95,10 +95,9 @@ def overlay(ax, snapshot: Snapshot, plane: int) -> None:
     across = (np.vstack([found, truth]) - (left, top)) / side
     corner = free_corner(across, INSET, ((0, 0), (1, 0), (0, 1), (1, 1)))
     inset = ax.inset_axes((0.015 + corner[0] * (0.97 - INSET), 0.015 + (1 - corner[1]) * (0.97 - INSET), INSET, INSET))
-    # noise alone must not set the grey levels, nor may a thin device be cut off
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
+    black, white = grey_levels(image)
     for axes, line in ((ax, 1.8), (inset, 2.2)):
-        axes.imshow(image, cmap='gray', vmin=smooth.min(), vmax=smooth.max(), interpolation='bilinear')
+        axes.imshow(image, cmap='gray', vmin=black, vmax=white, interpolation='bilinear')
         axes.plot(*found.T, color=FOUND, lw=line, alpha=0.8)
         axes.set(xticks=[], yticks=[])
     for spine in ax.spines.values():
@@ -117,11 +116,6 @@ def overlay(ax, snapshot: Snapshot, plane: int) -> None:
     label = dict(transform=ax.transAxes, ha='center', bbox=dict(facecolor=GROUND, edgecolor='none', alpha=0.7, pad=2))
     ax.text(begin + bar / 2, 0.06, f'{SCALE_BAR * 1e3:g} mm', va='bottom', **label)
     ax.text(0.5, 0.98, f'plane {"AB"[plane]}', va='top', fontsize=14, fontweight='bold', **label)
-
-
-def free_corner(points: np.ndarray, side: float, corners) -> tuple[int, int]:
-    """The one of `corners` (right, below: 0 or 1) whose square of `side` holds fewest of (N, 2) points in the unit square, v down."""
-    return min(corners, key=lambda c: np.count_nonzero((np.abs(points - np.array(c)) < side + 0.03).all(axis=1)))
 
 
 def window(points_px: np.ndarray, shape: tuple[int, int]) -> tuple[float, float, float]:
@@ -152,7 +146,7 @@ def backbone(ax, bar_ax, snapshot: Snapshot) -> None:
     ax.plot(*truth.T, '--', color=TRUTH, lw=1.5, label='truth', zorder=10)
     ax.plot(*found[-1:].T, 'o', color=TIP, ms=9, label='tip found', zorder=11)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel='x (mm)', ylabel='y (mm)', zlabel='z (mm)')
-    ax.set_box_aspect(half, zoom=min(1.0, 0.6 * np.linalg.norm(half) / half[2]))     # a tall box keeps to its axes
+    ax.set_box_aspect(half, zoom=min(0.9, 0.6 * np.linalg.norm(half) / half[2]))     # a tall box keeps to its axes
     ax.tick_params(labelsize=8)
     ax.patch.set_visible(False)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):

@@ -26,7 +26,7 @@ from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, Tally, dia
 from msg_adapters.messages import stamp_ns
 
 from ..config import Config, ConfigError
-from ..data import Outcome, Reconstruction
+from ..data import Frame, Outcome, Reconstruction
 from ..pairing import PLANES, Counts, Pairer
 from ..pipeline import reconstruct
 from ..worker import Camera, Job, Memory, adapt, camera, checked_camera, image_window, view_of
@@ -51,6 +51,7 @@ class Summary:
     outcomes: Counter = field(default_factory=Counter)      # by name
     warnings: Counter = field(default_factory=Counter)
     refused: dict[str, str] = field(default_factory=dict)   # plane -> why its last refused camera info was
+    masked: int = 0                                         # pairs that made the mask
     bug: str = ''                                           # what went wrong in the first pair that ended in internal_error
 
     def count(self, stamp: int, result: Reconstruction) -> None:
@@ -70,6 +71,8 @@ def main(argv=None) -> int:
     parser.add_argument('--with-images', action='store_true', help='copy the images and camera infos too, logged at their stamps')
     parser.add_argument('--start', type=_seconds, default=0.0, metavar='S', help='skip the first S seconds')
     parser.add_argument('--duration', type=_seconds, default=math.inf, metavar='S', help='stop after S seconds')
+    parser.add_argument('--mask', type=_seconds, default=0.0, metavar='S',
+                        help='the first S seconds of the bag show no device: their mean is the mask image, subtracted from all later images')
     parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE', help='a parameter of fluoro_shape_node; may be repeated')
     parser.add_argument('--params', metavar='YAML', help='a ROS parameter file with the parameters of fluoro_shape')
     for plane in PLANES:
@@ -101,11 +104,13 @@ def _body(args, parser: argparse.ArgumentParser) -> None:
     infos = {absolute(getattr(args, f'info_{p}')): p for p in PLANES}
     if len(images) < 2 or len(infos) < 2:
         parser.error('both planes have the same topic')
+    if args.start + args.duration <= args.mask:
+        parser.error('--mask: nothing is left to reconstruct before the end of --duration')
     try:
         with open_bag(args.bag) as bag:
             _check_topics(bag.types(), images, infos)
             with create_bag(args.out, args.storage) as out:
-                summary = replay(bag, out, config, images, infos, (args.start, args.duration), args.with_images)
+                summary = replay(bag, out, config, images, infos, (args.start, args.duration), args.with_images, args.mask)
     except BadBag as error:
         raise ToolError(str(error)) from error
     print(report(summary, args.out))
@@ -125,11 +130,11 @@ def _check_topics(types: dict[str, str], images: dict[str, str], infos: dict[str
 
 
 def replay(bag, out, config: Config, images: dict[str, str], infos: dict[str, str], window: tuple[float, float] = (0.0, math.inf),
-           with_images: bool = False) -> Summary:
+           with_images: bool = False, mask_s: float = 0.0) -> Summary:
     """Reconstruct every pair of `bag` (of open_bag) and write the results to `out` (of create_bag).
 
-    `images` and `infos` map topics to planes; `window` is the start and the duration in s. Raises ToolError where no images pair,
-    BadBag where the bag is damaged.
+    `images` and `infos` map topics to planes; `window` is the start and the duration in s. The pairs of the first `mask_s` of the bag
+    are not reconstructed: they make the mask of the others. Raises ToolError where no images pair, BadBag where the bag is damaged.
     """
     cv2.setNumThreads(config.input.threads or -1)   # 0 would mean none for OpenCV
     for topic, (kind, _) in RESULTS.items():
@@ -143,14 +148,27 @@ def replay(bag, out, config: Config, images: dict[str, str], infos: dict[str, st
     summary = Summary()
     cameras = read_cameras(bag, config, infos, summary)
     pairer, memory, views = Pairer(round(config.input.sync_slop * 1e9)), Memory(), lru_cache(maxsize=8)(view_of)
-    stream = tqdm(bag.messages(images, *span), 'replaying', total, unit='image', disable=None)
-    for stamp_a, *pair in _pairs(stream, images, pairer, memory, summary):
-        held = tuple(camera_at(cameras[plane], stamp_ns(message)) for plane, message in zip(PLANES, pair))
-        frame_id, result = answer(Job(stamp_a, tuple(pair), held, config, memory.generation, 0.0), memory, views)
-        write_result(out, stamp_a, frame_id, result)
-        summary.count(stamp_a, result)
+
+    def jobs(what, total, start_ns, stop_ns):
+        stream = tqdm(bag.messages(images, start_ns, stop_ns), what, total, unit='image', disable=None)
+        for stamp_a, *pair in _pairs(stream, images, pairer, memory, summary):
+            held = tuple(camera_at(cameras[plane], stamp_ns(message)) for plane, message in zip(PLANES, pair))
+            yield Job(stamp_a, tuple(pair), held, config, memory.generation, 0.0)
+
+    if mask_s:
+        until_ns = bag.start_ns + round(mask_s * 1e9)
+        span, total = (max(span[0] or 0, until_ns), span[1]), None
+        summary.masked = take_mask(jobs('mask', None, None, until_ns), memory, views)
+        if not summary.masked:
+            raise ToolError(f'--mask {mask_s:g}: there is no usable pair in the first {mask_s:g} s of the bag')
+    for job in jobs('replaying', total, *span):
+        _, result = answer(job, memory, views)
+        write_result(out, job, result)
+        summary.count(job.stamp_ns, result)
     summary.counts = dataclasses.replace(pairer.counts, unpaired=pairer.counts.unpaired + pairer.waiting)
     if not summary.outcomes:
+        if summary.masked:
+            raise ToolError(f'--mask {mask_s:g}: no pair comes after the {summary.masked} that made the mask')
         raise ToolError(f'no images pair: there are {summary.images["a"]} of plane A and {summary.images["b"]} of plane B, '
                         f'{summary.counts.unstamped} without a stamp; sync_slop is {config.input.sync_slop * 1e3:g} ms')
     return summary
@@ -179,7 +197,7 @@ def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary) -
         plane, entry = infos[recorded.topic], camera(recorded.message)
         try:
             if not known[plane] or known[plane][-1][1] != entry:
-                checked_camera(recorded.message, config)
+                checked_camera(recorded.message, config, plane)
             known[plane].append((stamp_ns(recorded.message), entry))
         except BadCameraInfo as error:
             summary.refused[plane] = str(error)
@@ -203,22 +221,33 @@ def _pairs(stream, images: dict[str, str], pairer: Pairer, memory: Memory, summa
             yield pair
 
 
-def answer(job: Job, memory: Memory, views) -> tuple[str, Reconstruction]:
-    """The frame and the answer to a pair of messages."""
+def take_mask(jobs: Iterator[Job], memory: Memory, views) -> int:
+    """Make the mean of pairs of messages the mask; how many these were. Bad ones are left out."""
+    memory.capture_mask(sys.maxsize)
+    for job in jobs:
+        frame = adapt(job, views, None, Tally())
+        if isinstance(frame, Frame):
+            memory.take_for_mask(frame, image_window(job, frame))
+    return memory.finish_mask()
+
+
+def answer(job: Job, memory: Memory, views) -> tuple[Frame | None, Reconstruction]:
+    """The frame of a pair of messages, None where they can't be one, and the answer."""
     tally = Tally()
     frame = adapt(job, views, None, tally)
     if isinstance(frame, Reconstruction):
-        return '', frame
+        return None, frame
     try:
         result = reconstruct(frame, job.config, memory.prior(job, frame, image_window(job, frame), tally))
     except Exception as error:  # the last line of defence: a pair must not take the other thousands with it; the tool ends with 1
-        return '', Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
+        return frame, Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
     memory.remember(job, frame, result)
-    return frame.frame_id, result
+    return frame, result
 
 
-def write_result(out, stamp: int, frame_id: str, result: Reconstruction) -> None:
+def write_result(out, job: Job, result: Reconstruction) -> None:
     """One diagnostics message a pair, and the shape where there is one."""
+    stamp = job.stamp_ns
     level = ERROR if result.outcome in FAULTS else WARN if result.outcome is not Outcome.OK or result.warnings else OK
     reason = ': '.join(filter(None, (result.outcome.value, result.detail)))
     status = Status('reconstruction', level, '; '.join((reason, *result.warnings)),
@@ -226,20 +255,22 @@ def write_result(out, stamp: int, frame_id: str, result: Reconstruction) -> None
     out.write('/diagnostics', diagnostic_array([status], stamp, NODE, out.new), stamp)
     if result.shape is not None:
         for topic, (_, adapter) in RESULTS.items():
-            out.write(topic, adapter(result.shape, stamp, frame_id, out.new), stamp)
+            out.write(topic, adapter(result.shape, stamp, job.frame_id, out.new), stamp)
 
 
 def report(summary: Summary, out: str) -> str:
     """The summary for people."""
     c = summary.counts
     lines = [f'{c.pairs} pairs of {summary.images["a"]} images of plane A and {summary.images["b"]} of plane B; results in {out}']
+    if summary.masked:
+        lines.append(f'{summary.masked:7d}  made the mask')
     lines += [f'{n:7d}  {name}' for name, n in (*summary.outcomes.most_common(), *summary.warnings.most_common())]
     lost = {'unpaired': c.unpaired, 'duplicate': c.duplicates, 'out of order': c.out_of_order, 'without a stamp': c.unstamped}
     if any(lost.values()):
         lines.append('images ' + ', '.join(f'{what}: {n}' for what, n in lost.items() if n))
     if c.jumps:
         lines.append(f'stamps jumped back: {c.jumps} times')
-    lines += [f'plane {plane}: camera infos refused: {reason}' for plane, reason in sorted(summary.refused.items())]
+    lines += [f'camera infos refused: {reason}' for _, reason in sorted(summary.refused.items())]
     return '\n'.join(lines)
 
 
