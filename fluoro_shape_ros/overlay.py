@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from .curve import arc_length, at_arc_length
 from .data import Outcome, Reconstruction, Shape, View
-from .geometry import distort, epipolar_lines, fundamental, project, projection_jacobian, undistort
+from .geometry import depth, distort, epipolar_lines, fundamental, project, projection_jacobian, undistort
 
 SEEN, FOUND, TIP, EPIPOLAR = '#ffb347', '#2ad4ff', '#ff5a5f', '#c58bff'
 GOOD, REJECTED, WORDS = '#5ee07a', '#ffb347', '#ffffff'
@@ -22,6 +22,7 @@ CONFIDENCE = 0.95       # of the tip's ellipse
 END_PX = 15.0           # an end of a centreline this near to the reprojected tip is where its plane sees the tip
 INSET = 0.25            # side of the magnified surroundings of the tip, share of the image's shorter side
 INSET_HALF = 8          # line widths from the tip to the inset's border
+NOISE_SPAN = 8          # from black to white, in median differences of neighbours: noise must not fill the range
 DASH = 6                # line widths, and as much to the next
 SHIFT = 4               # fractional bits of OpenCV's coordinates
 
@@ -47,7 +48,8 @@ def overlay(image: np.ndarray, plane: int, result: Reconstruction, views: tuple[
     inset = None
     if result.shape is not None and strokes:
         tip = distort(views[plane], project(views[plane].P, result.shape.points[-1:]))[0]
-        inset = magnified(canvas, strokes, tip, unit)
+        if (np.abs(tip / (image.shape[1], image.shape[0]) - 0.5) < 0.5).all():      # in the image; NaN is not
+            inset = magnified(canvas, strokes, tip, unit)
     draw(canvas, strokes, unit)
     title, *rest = words(result)
     colour = GOOD if result.outcome is Outcome.OK else REJECTED
@@ -96,7 +98,7 @@ def evidence(plane: int, result: Reconstruction, views: tuple[View, View]) -> li
 
 def tip_ellipse(view: View, shape: Shape) -> np.ndarray | None:
     """(65, 2) px, the closed contour within which the tip lies with CONFIDENCE; None where the method does not know it."""
-    if not np.isfinite(shape.covariance[-1]).all():
+    if not np.isfinite(shape.covariance[-1]).all() or depth(view.P, shape.tip) <= 0:
         return None
     J = projection_jacobian(view.P, shape.tip[None])[0]
     variance, axes = np.linalg.eigh(J @ shape.covariance[-1] @ J.T)
@@ -125,7 +127,7 @@ def across(line: np.ndarray, width: int, height: int) -> np.ndarray:
     """(N, 2) px, points of the (3,) normalised line in and around an image; none where it misses that."""
     center = np.array([width - 1, height - 1]) / 2
     foot = center - (line[:2] @ center + line[2]) * line[:2]
-    points = foot + np.linspace(-1, 1, 129)[:, None] * np.hypot(width, height) * np.array([-line[1], line[0]])
+    points = foot + np.linspace(-1, 1, 65)[:, None] * np.hypot(width, height) * np.array([-line[1], line[0]])
     return points[(np.abs(points - center) < 0.55 * np.array([width, height])).all(axis=1)]     # farther out a distortion model says nothing
 
 
@@ -135,17 +137,23 @@ def across(line: np.ndarray, width: int, height: int) -> np.ndarray:
 def grey_levels(image: np.ndarray) -> tuple[float, float]:
     """The levels of an (H, W) image of any range that are to be black and white: neither noise nor the unexposed border sets them."""
     h, w = image.shape
-    small = cv2.resize(image, (-(-w // 4), -(-h // 4)), interpolation=cv2.INTER_AREA)[::2]
-    exposed = small[small > 0.12 * np.percentile(small[::4, ::4], 95)]
+    small = cv2.resize(image, (-(-w // 4), -(-h // 4)), interpolation=cv2.INTER_AREA)
+    exposed = small > 0.12 * np.percentile(small[::4, ::4], 95)
+    exposed = small[cv2.erode(exposed.astype(np.uint8), np.ones((5, 5))) > 0][::2]      # without the field's blurred rim
     low, high = np.percentile(exposed if exposed.size else small, (0.1, 99.9))
-    middle, half = (low + high) / 2, max(high - low, 0.2 * abs(high), 1e-6) / 2
+    noise = np.median(np.abs(np.diff(image[::32].astype(np.float32)))) if w > 1 else 0.0
+    middle, half = (low + high) / 2, max(high - low, NOISE_SPAN * noise, 0.01 * abs(high), 1e-6) / 2
     return float(middle - half), float(middle + half)
 
 
 def stretched(image: np.ndarray) -> np.ndarray:
     """(H, W) uint8, the image between its `grey_levels`."""
     low, high = grey_levels(image)
-    return cv2.convertScaleAbs(cv2.max(cv2.subtract(image, low), 0.0), alpha=255 / (high - low))
+    scale = 255 / (high - low)
+    if image.dtype == np.uint8:
+        return cv2.LUT(image, np.clip((np.arange(256) - low) * scale, 0, 255).astype(np.uint8))
+    black = image.dtype.type(low if image.dtype.kind == 'f' else max(np.ceil(low), 0))
+    return cv2.convertScaleAbs(np.maximum(image, black), alpha=scale, beta=-scale * low)
 
 
 def draw(canvas: np.ndarray, strokes: list[Stroke], unit: int) -> None:
@@ -194,7 +202,7 @@ def free_corner(points: np.ndarray, side: float, corners=((0, 1), (1, 1), (0, 0)
 def write(canvas: np.ndarray, lines: list[tuple[str, str]]) -> int:
     """Write (text, colour) lines on a darkened strip at the top, broken where they are too long; the strip's height in px."""
     font = _font(canvas)
-    room = canvas.shape[1] - 2 * font['height']
+    room = canvas.shape[1] - 3 * font['height']
     broken = [(part, colour) for text, colour in lines for part in textwrap.wrap(text, max(8, int(len(text) * room / max(_length(text, font), 1))))]
     step = round(1.5 * font['height'])
     strip = step * len(broken) + font['height'] // 2
