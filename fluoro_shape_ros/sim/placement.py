@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..data import View
 from ..geometry import epipolar_lines, fundamental, project, source
@@ -57,7 +59,7 @@ def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, leng
     views = tuple(f.view for f in fields)
     make, suits = KINDS[kind]
     for _ in range(ATTEMPTS):
-        shape = make(rng, rng.uniform(*lengths))
+        shape = make(rng, rng.uniform(*lengths), views)
         if not suits(shape.backbone(2e-3), views) or not _stays_inside(shape, fields):
             continue
         if not entering:
@@ -118,21 +120,33 @@ def _crosses(uv: np.ndarray) -> bool:
     return bool(np.triu((t >= 0) & (t <= 1) & (t.T >= 0) & (t.T <= 1), 2).any())
 
 
-def _looped(rng: np.random.Generator, length: float) -> shapes.Spline:
-    """A loose turn of a screw, as a catheter loops: seen along the screw's axis it crosses itself. It bends as tight as other shapes do."""
+def _spline(rng: np.random.Generator, length: float, views) -> shapes.Spline:
+    return shapes.random_spline(rng, length)
+
+
+def _cannula(rng: np.random.Generator, length: float, views) -> shapes.Cannula:
+    return shapes.random_cannula(rng, length)
+
+
+def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
+    """A loose turn of a screw, as a catheter loops, with its axis near one of the viewing directions; it bends as tight as other shapes do."""
     knots = np.arange(max(4, int(np.ceil(length / shapes.KNOT_SPACING)) + 1))
-    pitch = rng.uniform(0.3, 0.6) + rng.normal(0, 0.05, len(knots))
+    pitch = rng.uniform(0.4, 0.7) + rng.normal(0, 0.05, len(knots))
     yaw = shapes.MAX_CURVATURE * shapes.KNOT_SPACING * knots + rng.normal(0, 0.05, len(knots))
-    shape = shapes.Spline(length, np.c_[yaw, pitch])
-    tightest = np.hypot(*shape.angles()(np.linspace(0.0, length, 500), 1).T).max()
-    return shapes.centred(rng, shapes.Spline(length, np.c_[yaw * rng.uniform(0.9, 1.0) * shapes.MAX_CURVATURE / tightest, pitch]))
+    loop = shapes.Spline(length, np.c_[yaw, pitch])
+    s = np.linspace(0.0, length, 500)
+    tightest = np.hypot(*(loop.angles()(s, 1) * np.c_[np.cos(loop.angles()(s)[:, 1]), np.ones(500)]).T).max()
+    loop = shapes.centred(rng, shapes.Spline(length, np.c_[yaw * shapes.MAX_CURVATURE / tightest, pitch]))
+    axis, beam = loop.pose.heading[:, 2], views[rng.integers(2)].P[2, :3] + rng.normal(0, 0.3, 3)
+    turn = Rotation.align_vectors([beam], [axis])[0].as_matrix()     # about the origin, which the shape stands at
+    return dataclasses.replace(loop, pose=shapes.Pose(turn @ loop.pose.base, turn @ loop.pose.heading))
 
 
-# what a kind of shape is drawn from, and what its (N, 3) points must suit, seen in two views
+# how a kind of shape is drawn for two views, and what its (N, 3) points must suit in them
 KINDS: dict[str, tuple[Callable, Callable]] = {
-    'spline': (shapes.random_spline, well_seen),
-    'cannula': (shapes.random_cannula, well_seen),
-    'tangent': (shapes.random_spline, turns_back),
+    'spline': (_spline, well_seen),
+    'cannula': (_cannula, well_seen),
+    'tangent': (_spline, turns_back),
     'crossing': (_looped, crosses_itself),
 }
 
