@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
 SIZE = 320                          # px, both ways
+RADIUS = 'robot_radius:=0.001'      # of the line drawn
 STEP_NS = 66_000_000
 DOMAIN = 1 + 2 * (os.getpid() % 50)     # two runs on one machine do not meet
 OTHER = DOMAIN + 1                  # for a second node beside the first
@@ -33,6 +35,9 @@ def curve():
     """(600, 3) m, base to tip: 10 cm long, bent in space."""
     s = np.linspace(0, 1, 600)
     return np.c_[0.03 * np.sin(2.2 * s) - 0.01, 0.025 * (1 - np.cos(1.7 * s)) - 0.01, 0.09 * s - 0.045]
+
+
+BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])     # so that the tip is no guess
 
 
 def projection(angle_deg, size=SIZE):
@@ -83,6 +88,11 @@ def info_msg(P, size=SIZE, **fields):
     values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5, k=[800.0, 0, size / 2, 0, 800.0, size / 2, 0, 0, 1],
                   r=np.eye(3).ravel().tolist(), p=P.ravel().tolist())
     return CameraInfo(**{**values, **fields})
+
+
+def points(path):
+    """(N, 3) m, of a Path."""
+    return np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses])
 
 
 class NodeProcess:
@@ -143,8 +153,21 @@ class Client:
 
     def _keep(self, messages):
         def callback(msg):
-            messages[msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec] = msg
+            head = msg.markers[0].header if hasattr(msg, 'markers') else msg.header
+            messages[head.stamp.sec * 10**9 + head.stamp.nanosec] = msg
         return callback
+
+    @contextmanager
+    def listening(self, topics):
+        """Subscribed to `topics` (name to type) for a while: topic to the messages heard, by stamp."""
+        heard = {topic: {} for topic in topics}
+        subscriptions = [self.node.create_subscription(kind, topic, self._keep(heard[topic]), 10) for topic, kind in topics.items()]
+        try:
+            assert self.until(lambda: all(self.node.count_publishers(topic) for topic in topics))
+            yield heard
+        finally:
+            for subscription in subscriptions:
+                self.node.destroy_subscription(subscription)
 
     def until(self, condition, limit=20.0):
         """Whether `condition()` came true before the deadline."""

@@ -15,12 +15,11 @@ from nav_msgs.msg import Path                       # noqa: E402
 from rcl_interfaces.srv import GetParameters        # noqa: E402
 from rclpy.parameter import Parameter               # noqa: E402
 from rclpy.qos import ReliabilityPolicy             # noqa: E402
-from ros_client import BLANK, GOOD, SIZE, VIEWS, Client, NodeProcess, image_msg, info_msg   # noqa: E402
+from ros_client import BASE, BLANK, GOOD, SIZE, VIEWS, Client, NodeProcess, image_msg, info_msg, points     # noqa: E402
 from std_srvs.srv import SetBool                    # noqa: E402
 
 TOLERANCE = 0.0025      # m: an image pixel is 1 mm, the line is drawn on whole pixels
-BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*ros.curve()[0])
-PARAMETERS = ('reference_frame:=cell', 'mask_frames:=2', BASE)
+PARAMETERS = ('reference_frame:=cell', 'mask_frames:=2', BASE, ros.RADIUS)
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -51,10 +50,6 @@ def stream(node):
 def client(stream):
     yield stream
     assert stream.good()        # whatever a test did, the next good pair works
-
-
-def points(path):
-    return np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in path.poses])
 
 
 def test_good_pair(client):
@@ -112,7 +107,7 @@ def test_an_image_that_contradicts_its_camera_info_is_named(client):
 
 def test_a_bad_camera_info_is_named_and_the_one_before_holds(client):
     stamp = client.send_pixels(GOOD, infos=[info_msg(VIEWS[0], p=[0.0] * 12), info_msg(VIEWS[1])])
-    assert client.hears('camera info refused', 'P is zero')
+    assert client.hears('camera info refused', 'plane a: P is zero')
     assert client.answer(stamp)
 
 
@@ -265,7 +260,7 @@ def log(tmp_path):
 
 def test_images_before_any_camera_info_a_qos_override_and_sigint(log):
     override = 'qos_overrides./plane_b/image_raw.subscription.reliability:=best_effort'
-    with NodeProcess(log, override, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+    with NodeProcess(log, override, ros.RADIUS, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected(), node.log
         heard = lambda: any('no_camera_info' in s.message for s in client.statuses)     # noqa: E731
         assert client.insist(heard, infos=[])
@@ -301,7 +296,7 @@ def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
             return real(*arguments)
         pipeline.reconstruct = buggy
         sys.exit(main())"""
-    with NodeProcess(log, BASE, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+    with NodeProcess(log, BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected() and client.insist(lambda: client.paths), node.log
         assert client.value('reconstruction', 'count internal_error') == '2'
         assert node.log.count('Traceback') == 1 and 'IndexError' in node.log

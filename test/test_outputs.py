@@ -1,0 +1,104 @@
+"""What the node publishes only while somebody listens, on real topics."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+import ros_client as ros                                        # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped         # noqa: E402
+from ros_client import BASE, BLANK, GOOD, SIZE, VIEWS, Client, NodeProcess, image_msg, points   # noqa: E402
+from sensor_msgs.msg import Image, PointCloud2                  # noqa: E402
+from visualization_msgs.msg import MarkerArray                  # noqa: E402
+
+from msg_adapters.messages import stamp_ns                      # noqa: E402
+
+TOLERANCE = 0.0025      # m: an image pixel is 1 mm
+ON_DEMAND = {'tip_pose': PoseWithCovarianceStamped, 'backbone_points': PointCloud2, 'markers': MarkerArray,
+             'plane_a/overlay': Image, 'plane_b/overlay': Image}
+
+
+@pytest.fixture(scope='module', autouse=True)
+def environment():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        yield
+
+
+@pytest.fixture(scope='module')
+def client(environment, tmp_path_factory):
+    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', 'reference_frame:=cell', BASE, ros.RADIUS) as node, Client() as client:
+        assert client.connected() and client.good(), node.log
+        yield client
+        assert node.process.poll() is None and 'Traceback' not in node.log, node.log
+
+
+@pytest.fixture(scope='module')
+def heard(client):
+    """What comes, by topic and stamp."""
+    with client.listening(ON_DEMAND) as heard:
+        assert client.insist(lambda: all(heard.values()), every=1.0)
+        assert client.good()    # by now none of the first ones is under way
+        yield heard
+
+
+def heard_all(client, heard, stamp, topics=ON_DEMAND):
+    assert client.until(lambda: all(stamp in heard[topic] for topic in topics)), {t: sorted(m)[-3:] for t, m in heard.items()}
+    return [heard[topic][stamp] for topic in topics]
+
+
+def test_outputs_on_demand(client, heard):
+    stamp = client.send_pixels(GOOD, skew_ns=5_000_000)
+    path, tip = client.answer(stamp)
+    pose, cloud, markers, *overlays = heard_all(client, heard, stamp)
+    assert {m.header.frame_id for m in (pose, cloud, *overlays, *markers.markers)} == {'cell'}
+    assert {stamp_ns(m) for m in (*overlays, *markers.markers)} == {stamp}
+    assert pose.pose.pose == path.poses[-1].pose
+    variance = np.diag(pose.pose.covariance.reshape(6, 6))[:3]
+    assert (variance > 0).all() and np.sqrt(variance.max()) < TOLERANCE
+    assert cloud.width == len(path.poses) and cloud.fields[4].name == 'sigma'
+    tube = next(m for m in markers.markers if m.ns == 'tube')
+    corners = np.array([[p.x, p.y, p.z] for p in tube.points])
+    assert np.allclose(np.linalg.norm(corners[:, None] - points(path), axis=2).min(axis=1), 0.001, rtol=0.01)     # robot_radius
+    for picture, P in zip(overlays, VIEWS):
+        assert (picture.encoding, picture.height, picture.width, picture.step) == ('bgr8', SIZE, SIZE, 3 * SIZE)
+        u, v, w = P @ [*points(path)[len(path.poses) // 2], 1]
+        pixels = np.frombuffer(picture.data, np.uint8).reshape(SIZE, SIZE, 3)
+        assert np.ptp(pixels[round(v / w), round(u / w)]) > 60      # something coloured is drawn there
+
+
+def test_a_rejected_pair_is_shown_with_its_reason_and_nothing_else(client, heard):
+    stamp = client.send_pixels([GOOD[0], BLANK[1]])
+    markers, *overlays = heard_all(client, heard, stamp, ['markers', 'plane_a/overlay', 'plane_b/overlay'])
+    text = {m.ns: m for m in markers.markers}['outcome']
+    assert text.action == text.ADD and 'no device in plane b' in text.text
+    assert all(m.action == m.DELETE for m in markers.markers if m is not text)
+    assert client.good() and stamp not in heard['tip_pose'] and stamp not in heard['backbone_points']
+
+
+def test_a_pair_without_geometry_is_shown_as_it_came(client, heard):
+    small = [pixels[:100, :100] for pixels in GOOD]
+    stamp = client.send_pixels(small)
+    markers, *overlays = heard_all(client, heard, stamp, ['markers', 'plane_a/overlay', 'plane_b/overlay'])
+    assert all(m.action == m.DELETE for m in markers.markers)
+    assert [(m.width, m.header.frame_id) for m in overlays] == [(100, 'cell')] * 2
+    stamp = client.send([image_msg(GOOD[0]), image_msg(GOOD[1], encoding='yuv422')])
+    heard_all(client, heard, stamp, ['plane_a/overlay'])
+    assert client.good() and stamp not in heard['plane_b/overlay']
+
+
+def test_what_nobody_listens_to_is_not_computed(tmp_path):
+    code = """if True:
+        import sys
+        import fluoro_shape_ros.outputs as outputs
+        from fluoro_shape_ros.node import main
+        for name in ('overlay', 'shape_to_markers'):
+            real = getattr(outputs, name)
+            setattr(outputs, name, lambda *a, real=real, name=name: print('made', name, flush=True) or real(*a))
+        sys.exit(main())"""
+    with NodeProcess(tmp_path / 'log.txt', BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+        assert client.connected() and client.insist(lambda: client.paths), node.log
+        assert client.good() and client.good() and 'made' not in node.log
+        with client.listening({'markers': MarkerArray}) as heard:
+            assert client.insist(lambda: heard['markers'])
+        assert 'made shape_to_markers' in node.log and 'made overlay' not in node.log
