@@ -4,11 +4,19 @@ import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial import cKDTree
 
+from fluoro_shape_ros.config import Config
+from fluoro_shape_ros.data import Outcome, Prior
 from fluoro_shape_ros.mask import shift_between, subtract
+from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.anatomy import anatomy
+from fluoro_shape_ros.sim.carm import CArm, biplane
+from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.sim.xray import Exposure
 
 SIZE = (512, 512)
+VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
 LEVEL = 200.0
 NOISE = 0.010           # of a pixel at LEVEL, as a share of it
 
@@ -84,3 +92,27 @@ def test_any_depth_of_image_will_do(dtype):
     counts = np.rint(background()).astype(dtype)
     left = subtract(counts, counts.astype(np.float32))
     assert left.dtype == np.float32 and left.std() < 1e-3 * left.mean()
+
+
+def fluoroscopy(seed):
+    """A run with a faint device, and the masks taken before it comes in."""
+    run = xray_run(seed, views=VIEWS, lengths=(0.06, 0.07), exposure=Exposure(contrast=0.12))
+    frames = [run.without_device(index=k) for k in range(8, 16)]
+    return run, [np.mean([f.images[i].astype(np.float32) for f in frames], axis=0) for i in (0, 1)]
+
+
+@pytest.mark.parametrize('seed', [1, 3])
+@pytest.mark.parametrize('shift', [(0.0, 0.0), (2.3, -1.6)])
+def test_the_pipeline_sees_a_faint_device_through_its_masks(seed, shift):
+    run, masks = fluoroscopy(seed)
+    scene, move = run.scene(), np.float32([[1, 0, shift[0]], [0, 1, shift[1]]])
+    masks = tuple(cv2.warpAffine(m, move, SIZE[::-1], borderMode=cv2.BORDER_REPLICATE) for m in masks)
+    result = reconstruct(scene.frame, Config.from_values(base_position=scene.base_position.tolist()), Prior(masks=masks))
+    assert result.outcome is Outcome.OK, result.detail
+    assert cKDTree(scene.truth).query(result.shape.points)[0].mean() < 0.1e-3
+    assert np.linalg.norm(result.shape.tip - scene.truth[-1]) < 0.4e-3
+
+
+def test_an_empty_field_behind_its_mask_shows_no_device():
+    run, masks = fluoroscopy(1)
+    assert reconstruct(run.without_device(), Config(), Prior(masks=tuple(masks))).outcome in (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)

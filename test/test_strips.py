@@ -53,7 +53,7 @@ def test_a_known_offset_is_measured(direction, offset):
     strips = strips_of(direction, offset_px=offset)
     m = measure(strips, profile(strips))
     assert abs(np.median(m.offset_px) - offset) < 0.02
-    assert np.abs(m.offset_px - offset).max() < 0.05        # interpolation between pixels
+    assert np.abs(m.offset_px - offset).max() < 0.07        # interpolation between pixels
     assert_allclose(m.presence, 1, atol=0.03)
 
 
