@@ -1,8 +1,4 @@
-"""The node as a process on real topics."""
-
-import signal
-import subprocess
-import sys
+"""The node on real topics."""
 
 import numpy as np
 import pytest
@@ -251,78 +247,3 @@ def test_a_best_effort_publisher_is_heard(node, stream):
         assert client.hears('best-effort')
         stream.now_ns = client.now_ns
     assert stream.good()
-
-
-@pytest.fixture
-def log(tmp_path):
-    return tmp_path / 'log.txt'
-
-
-def test_images_before_any_camera_info_a_qos_override_and_sigint(log):
-    override = 'qos_overrides./plane_b/image_raw.subscription.reliability:=best_effort'
-    with NodeProcess(log, override, ros.RADIUS, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
-        assert client.connected(), node.log
-        heard = lambda: any('no_camera_info' in s.message for s in client.statuses)     # noqa: E731
-        assert client.insist(heard, infos=[])
-        assert client.value('plane b', 'reliability') == 'best_effort'
-        path, _ = client.good()
-        assert path.header.frame_id == 'plane_a_optical'
-        assert node.end(signal.SIGINT) == 0 and 'Traceback' not in node.log
-
-
-def test_sigterm_in_the_middle_of_a_pair(log):
-    """A pair that never ends: the worker's thread can't be joined."""
-    code = """if True:
-        import sys, threading
-        import fluoro_shape_ros.pipeline as pipeline
-        from fluoro_shape_ros.node import main
-        pipeline.reconstruct = lambda *_: print('at work', flush=True) or threading.Event().wait()
-        sys.exit(main())"""
-    with NodeProcess(log, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
-        assert client.connected(), node.log
-        assert client.insist(lambda: 'at work' in node.log)
-        assert node.end(signal.SIGTERM) == 0 and 'Traceback' not in node.log
-
-
-def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
-    code = """if True:
-        import sys
-        import fluoro_shape_ros.pipeline as pipeline
-        from fluoro_shape_ros.node import main
-        real, left = pipeline.reconstruct, [0, 0]
-        def buggy(*arguments):
-            if left:
-                return [][left.pop()]
-            return real(*arguments)
-        pipeline.reconstruct = buggy
-        sys.exit(main())"""
-    with NodeProcess(log, BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
-        assert client.connected() and client.insist(lambda: client.paths), node.log
-        assert client.value('reconstruction', 'count internal_error') == '2'
-        assert node.log.count('Traceback') == 1 and 'IndexError' in node.log
-
-
-def run(*arguments, code=None):
-    start = ['-m', 'fluoro_shape_ros.node'] if code is None else ['-c', code]
-    return subprocess.run([sys.executable, *start, *arguments], capture_output=True, text=True, timeout=60)
-
-
-def test_help():
-    done = run('--help')
-    assert done.returncode == 0 and 'sync_slop' in done.stdout and not done.stderr
-
-
-@pytest.mark.parametrize('arguments, words', [
-    (['--speed', '3'], '--speed'),
-    (['--ros-args', '-p', 'robot_radius:=-1.0'], 'robot_radius: must lie in'),
-    (['--ros-args', '-p', 'polarity'], 'polarity'),
-    (['--ros-args', '--wings'], '--wings'),
-])
-def test_unusable_arguments(arguments, words):
-    done = run(*arguments)
-    assert done.returncode == 2 and words in done.stderr.splitlines()[-1] and 'Traceback' not in done.stderr
-
-
-def test_without_ros():
-    done = run(code='import sys; sys.modules["rclpy"] = None; from fluoro_shape_ros.node import main; sys.exit(main())')
-    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and 'rclpy' in done.stderr

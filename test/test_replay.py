@@ -10,62 +10,24 @@ import pytest
 pytest.importorskip('rosbags')
 pytest.importorskip('yaml')
 
-from drawing import BASE, BLANK, CALIBRATIONS, GOOD, TOLERANCE, curve   # noqa: E402
+from drawing import BASE, BLANK, CALIBRATIONS, GOOD, TOLERANCE, curve                               # noqa: E402
+from recording import IMAGE, INFO, RADIUS, SECOND, SKEW, main, outcomes, read, record               # noqa: E402
 from scipy.spatial import cKDTree                                       # noqa: E402
 
 from fluoro_shape_ros.config import Config, ConfigError                 # noqa: E402
 from fluoro_shape_ros.tools import replay                               # noqa: E402
 from fluoro_shape_ros.tools.parameters import read_parameters           # noqa: E402
-from msg_adapters.bags import create_bag, open_bag                      # noqa: E402
+from msg_adapters.bags import create_bag                      # noqa: E402
 from msg_adapters.calibration import calibration_to_camera_info         # noqa: E402
 from msg_adapters.images import array_to_image                          # noqa: E402
 from msg_adapters.messages import stamp_ns                              # noqa: E402
 from msg_adapters.shapes import path_to_points                          # noqa: E402
-
-SECOND = 10**9
-IMAGE, INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
-SKEW = 2_000_000        # of plane B's stamps, ns
-
-
-def record(path, pairs, storage='mcap', *, stamps=None, infos=True, spoil=lambda message: None, compressed=False):
-    """A bag of `pairs` of images, one every 0.1 s from 5 s on, logged 1 ms after their stamps."""
-    stamps = [5 * SECOND + k * SECOND // 10 for k in range(len(pairs))] if stamps is None else stamps
-    suffix, kind = ('/compressed', 'sensor_msgs/msg/CompressedImage') if compressed else ('', IMAGE)
-    with create_bag(path, storage) as bag:
-        for p in 'ab':
-            bag.declare(f'/plane_{p}/image_raw{suffix}', kind)
-            bag.declare(f'/plane_{p}/camera_info', INFO)
-        for k, (stamp, pair) in enumerate(zip(stamps, pairs)):
-            for p, pixels, calibration, skew in zip('ab', pair, CALIBRATIONS, (0, SKEW)):
-                log = 5 * SECOND + k * SECOND // 10 + 1_000_000
-                message = array_to_image(pixels, stamp + skew, f'plane_{p}_optical', bag.new)
-                spoil(message)
-                if compressed:
-                    message = bag.new(kind, header=message.header, format='png', data=cv2.imencode('.png', pixels)[1])
-                if infos:
-                    bag.write(f'/plane_{p}/camera_info', calibration_to_camera_info(calibration, stamp + skew, f'plane_{p}_optical', bag.new), log)
-                bag.write(f'/plane_{p}/image_raw{suffix}', message, log)
-    return path
 
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory):
     """Good, blank, good."""
     return record(tmp_path_factory.mktemp('recorded') / 'run', [GOOD, BLANK, GOOD])
-
-
-def read(path):
-    with open_bag(path) as bag:
-        return {topic: [(r.log_ns, r.message) for r in bag.messages([topic])] for topic in bag.types()}
-
-
-def outcomes(path):
-    """Outcome of every pair by its stamp, from the diagnostics."""
-    return {stamp_ns(m): {v.key: v.value for v in m.status[0].values}['last outcome'] for _, m in read(path)['/diagnostics']}
-
-
-def main(*arguments):
-    return replay.main([str(a) for a in arguments])
 
 
 def test_results_follow_the_contract(run, tmp_path, capsys):
@@ -124,6 +86,52 @@ def test_a_part_of_the_bag(run, tmp_path):
     assert list(outcomes(tmp_path / 'first')) == [5 * SECOND]
 
 
+def cluttered(pair):
+    """The pair in front of another, longer wire, which takes half of the beam."""
+    lines = [np.array([[20, 40], [300, 290]]), np.array([[20, 290], [300, 50]])]
+    passed = [cv2.GaussianBlur(cv2.polylines(np.ones(pixels.shape, np.float32), [line], False, 0.5, 2), (5, 5), 0) for pixels, line in zip(pair, lines)]
+    return [np.round(pixels * share).astype(np.uint8) for pixels, share in zip(pair, passed)]
+
+
+def test_the_first_seconds_as_mask(tmp_path, capsys):
+    """Without it the other wire is in the way; with it only the device is left. The pairs of the mask get no answer."""
+    record(tmp_path / 'run', [cluttered(BLANK), cluttered(BLANK), cluttered(GOOD), cluttered(GOOD)])
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', BASE, '--mask', 0.15) == 0
+    assert outcomes(tmp_path / 'out') == {5_200_000_000: 'ok', 5_300_000_000: 'ok'}
+    for _, path in read(tmp_path / 'out')['/backbone']:
+        assert cKDTree(curve()).query(path_to_points(path))[0].max() < TOLERANCE
+    said = capsys.readouterr().out
+    assert '2  made the mask' in said and '2  ok' in said
+    main(tmp_path / 'run', '--out', tmp_path / 'bare', '-p', BASE)
+    found = [path_to_points(path) for _, path in read(tmp_path / 'bare')['/backbone']]
+    assert not any(cKDTree(points).query(curve())[0].max() < TOLERANCE for points in found)
+
+
+def test_a_mask_of_bad_images_is_none(tmp_path, capsys):
+    def spoil(message):
+        message.encoding = 'yuv422' if stamp_ns(message) < 5_050_000_000 else message.encoding
+    record(tmp_path / 'run', [BLANK, GOOD], spoil=spoil)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '--mask', 0.05) == 1
+    assert '--mask 0.05: there is no usable pair in the first 0.05 s of the bag' in capsys.readouterr().err
+
+
+def test_a_mask_and_a_later_part_of_the_bag(tmp_path):
+    record(tmp_path / 'run', [BLANK, GOOD, GOOD, GOOD])
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '--mask', 0.05, '--start', 0.25) == 0
+    assert outcomes(tmp_path / 'out') == {5_300_000_000: 'ok'}
+    assert main(tmp_path / 'run', '--out', tmp_path / 'first', '--mask', 0.05, '--duration', 0.15) == 0
+    assert outcomes(tmp_path / 'first') == {5_100_000_000: 'ok'}
+
+
+@pytest.mark.parametrize('tracking, previous', [('true', [False, True, True]), ('false', [False] * 3)])
+def test_tracking_can_be_switched_off(tmp_path, monkeypatch, tracking, previous):
+    seen, intact = [], replay.reconstruct
+    monkeypatch.setattr(replay, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None) or intact(frame, config, prior))
+    record(tmp_path / 'run', [GOOD] * 3)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', f'tracking={tracking}') == 0
+    assert seen == previous
+
+
 def test_compressed_images(tmp_path):
     record(tmp_path / 'run', [GOOD], compressed=True)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', 'image_transport=compressed') == 0
@@ -166,7 +174,7 @@ def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, ca
             bag.write(f'/plane_{p}/image_raw', array_to_image(pixels, 3 * SECOND, 'f', bag.new), 3 * SECOND)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
     assert list(outcomes(tmp_path / 'out').values()) == ['ok']
-    assert 'plane b: camera infos refused: ' in (said := capsys.readouterr().out) and 'P is zero' in said
+    assert 'camera infos refused: plane b: P is zero' in capsys.readouterr().out
 
 
 def test_a_camera_holds_from_its_stamp_on():
@@ -215,7 +223,7 @@ def test_a_bad_parameter_file_is_named(tmp_path, text, says):
 
 def process(*arguments, code=None):
     start = ['-m', 'fluoro_shape_ros.tools.replay'] if code is None else ['-c', code]
-    return subprocess.run([sys.executable, *start, *map(str, arguments)], capture_output=True, text=True, timeout=120)
+    return subprocess.run([sys.executable, *start, '-p', RADIUS, *map(str, arguments)], capture_output=True, text=True, timeout=120)
 
 
 def test_as_a_process(run, tmp_path):
@@ -239,6 +247,8 @@ def test_as_a_process(run, tmp_path):
     (['run', '-p', 'geometry=tf'], 2, 'geometry: '),
     (['run', '--image-a', 'x', '--image-b', '/x'], 2, 'same topic'),
     (['run', '--start', '-1'], 2, '--start'),
+    (['run', '--mask', '1', '--duration', '0.5'], 2, '--mask: nothing is left'),
+    (['run', '--mask', '9'], 1, '--mask 9: no pair comes after the 3 that made the mask'),
     ([], 2, 'required'),
 ], ids=lambda value: ' '.join(value) if isinstance(value, list) else '')
 def test_what_can_not_work_is_said_in_one_line(run, tmp_path, monkeypatch, capsys, arguments, code, says):
