@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .curve import arc_length, at_arc_length
+from .curve import arc_length, resample
 
 DENSE = 0.05e-3     # m: both curves are sampled this finely, so that distances to points are distances to curves
 
@@ -34,6 +34,17 @@ def compare(points: np.ndarray, truth: np.ndarray) -> Errors:
 
 
 def _dense(points: np.ndarray) -> np.ndarray:
-    """Equal steps of DENSE counted from the tip, so that equal indices from the end are equal arc lengths from the tip."""
-    length = arc_length(points)[-1]
-    return at_arc_length(points[::-1], np.arange(0.0, length, DENSE))[::-1]
+    """A smooth curve through the points in steps of DENSE counted from the tip, so that equal indices from the end are equal arc lengths from
+    the tip; only the first step, at the base, may be shorter."""
+    return resample(points[::-1], DENSE)[0][::-1]
+
+
+def surprise(error: np.ndarray, covariance: np.ndarray) -> float:
+    """Squared Mahalanobis distance of a (3,) error under its reported (3, 3) covariance: chi-squared with three degrees of freedom where the
+    report is honest. NaN where the covariance is not known, inf where it leaves no room for the error."""
+    if not np.isfinite(covariance).all():
+        return float('nan')
+    variances, axes = np.linalg.eigh(covariance)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        terms = (error @ axes)**2 / np.maximum(variances, 0.0)
+    return float(np.nan_to_num(terms, nan=0.0, posinf=np.inf).sum())

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.metrics import compare
+from fluoro_shape_ros.metrics import compare, surprise
 
 LINE = np.c_[np.linspace(0, 0.1, 11), np.zeros(11), np.zeros(11)]
 
@@ -30,3 +30,34 @@ def test_base_cut_off_leaves_the_tip_alone():
     e = compare(LINE[2:], LINE)
     assert_allclose([e.tip, e.matched], 0, atol=1e-6)
     assert_allclose(e.length, 0.02, rtol=1e-6)
+
+
+def test_length_is_that_of_the_curve_not_of_its_chords():
+    turn = np.linspace(0, 2, 2001)
+    arc = np.c_[0.05 * np.cos(turn), 0.05 * np.sin(turn), np.zeros(2001)]
+    e = compare(arc[::40], arc)                         # chords of 2 mm are 0.017 mm shorter than the arc of 100 mm
+    assert e.length < 1e-6
+    assert_allclose([e.mean, e.tip], 0, atol=2e-6)
+    assert_allclose(compare(arc[:-7], arc).length, 0.05 * 2 * 7 / 2000, rtol=1e-3)      # less than a step of comparison would show
+
+
+def test_surprise_counts_standard_deviations():
+    covariance = np.diag([1.0, 4.0, 0.25])
+    assert_allclose(surprise(np.array([1.0, 2.0, 0.5]), covariance), 3)
+    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert_allclose(surprise(turned @ [0, 4.0, 0], turned @ covariance @ turned.T), 4)
+
+
+def test_surprise_where_nothing_or_too_much_is_claimed():
+    error = np.array([1.0, 0, 0])
+    assert np.isnan(surprise(error, np.full((3, 3), np.nan)))
+    assert surprise(error, np.diag([0.0, 1, 1])) == np.inf
+    assert surprise(error, np.diag([1.0, 0, 0])) == 1
+
+
+def test_honest_reports_hold_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    errors = rng.normal(size=(4000, 3)) @ root.T
+    inside = np.mean([surprise(e, root @ root.T) <= 7.815 for e in errors])
+    assert abs(inside - 0.95) < 0.015

@@ -1,100 +1,101 @@
-"""fluoro_shape_bench: how accurate, how robust, how fast; on seeded scenes with known truth."""
+"""fluoro_shape_bench: how accurate and how robust the reconstruction is, on seeded scenes with known truth."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import json
-from collections import Counter
+import math
 from pathlib import Path
 
-import numpy as np
+from tqdm import tqdm
 
-from ..config import Config
-from ..data import Outcome
-from ..metrics import Errors, compare
-from ..pipeline import reconstruct
+from ..config import fields
+from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
+from .composites import load
+from .families import ACCURACY, ROBUSTNESS, Family, on_real
+from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
-SILENT_MEAN, SILENT_TIP = 1e-3, 2e-3    # m: a published result farther off than this is a silent failure
-
-
-@dataclasses.dataclass(frozen=True)
-class Answer:
-    """One scene: what the method said and, where it gave a curve, how far off."""
-
-    seed: int
-    outcome: Outcome
-    errors: Errors | None
-
-    @property
-    def silent_failure(self) -> bool:
-        """Published, yet wrong."""
-        return self.errors is not None and (self.errors.mean > SILENT_MEAN or self.errors.tip > SILENT_TIP)
+METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
 
 
 def main(argv=None) -> int:
-    """The command line."""
-    parser = argparse.ArgumentParser('fluoro_shape_bench', description='Tables of accuracy on seeded scenes with known truth.')
+    """The command line. A command adds itself to the parser and says which function of (args, parser) is its body."""
+    parser = argparse.ArgumentParser('fluoro_shape_bench', description='Tables of accuracy and robustness on seeded scenes with known truth.')
     commands = parser.add_subparsers(dest='command', required=True)
-    accuracy = commands.add_parser('accuracy', help='errors in mm against truth, a row a family and method')
-    accuracy.add_argument('--families', nargs='+', default=['p'], metavar='NAME', help='families of scenes; "list" names them all (default: p)')
-    accuracy.add_argument('--methods', nargs='+', default=['paper'], metavar='METHOD', help='values of the parameter `method` (default: paper)')
-    accuracy.add_argument('--scenes', type=int, default=20, help='scenes of each family (default: 20)')
-    accuracy.add_argument('--first-seed', type=int, default=0, help='seeds count up from here (default: 0)')
-    accuracy.add_argument('--json', type=Path, metavar='FILE', help='write every scene\'s errors (m) there')
-    return run(_accuracy, parser, argv)
+    _add_tables(commands, 'accuracy', 'nothing but the device in the images, beside the Cramer-Rao bound', ACCURACY)
+    robustness = _add_tables(commands, 'robustness', 'one difficulty at a time, and scenes where nothing may be published', ROBUSTNESS)
+    robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
+                            'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
+    return run(lambda args: args.body(args, parser), parser, argv)
 
 
-def _accuracy(args) -> int:
-    from .families import FAMILIES
-    if args.families == ['list']:
-        print('\n'.join(f'{name:12s} {text}' for name, (text, _) in FAMILIES.items()))
-        return 0
-    if unknown := [f for f in args.families if f not in FAMILIES]:
-        raise ToolError(f'no such family: {", ".join(unknown)}; there are {", ".join(FAMILIES)}')
-    if args.scenes < 1:
-        raise ToolError(f'--scenes {args.scenes}: at least one is needed')
-    configs = {method: Config.from_values(method=method) for method in args.methods}
-    answers = {(family, method): [] for family in args.families for method in configs}
-    tqdm = need('tqdm', 'bench')
-    todo = [(family, args.first_seed + k) for family in args.families for k in range(args.scenes)]
-    for family, seed in tqdm.tqdm(todo, unit='scene', disable=None):
-        scene = FAMILIES[family][1](seed)
-        for method, config in configs.items():
-            answers[family, method].append(answer(scene, config))
-    print(table(answers))
+def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
+    """A command that prints the table of `families`."""
+    epilog = 'families:\n' + '\n'.join(f'  {n:12s} {f.text}' for n, f in families.items())
+    command = commands.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument('--families', nargs='+', metavar='NAME', help='(default: all)')
+    command.add_argument('--methods', nargs='+', metavar='METHOD', choices=METHODS, default=list(METHODS), help=f'of {", ".join(METHODS)} (default: all)')
+    command.add_argument('--scenes', type=_count, default=20, metavar='N', help='scenes of each family (default: 20)')
+    command.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    command.add_argument('--jobs', type=_count, default=2, metavar='N', help='processes of one thread each; the table does not depend on it (default: 2)')
+    command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every scene\'s answers there, in m')
+    command.add_argument('--plot', type=Path, metavar='FILE.png', help='draw errors and shares')
+    command.set_defaults(body=_tables, group=families, real=None)
+    return command
+
+
+def _tables(args, parser: argparse.ArgumentParser) -> int:
+    """Try all scenes, print the table, write the files."""
+    if args.real:
+        load(args.real)     # says at once what is wrong with it
+    known = args.group | (on_real(args.real) if args.real else {})
+    names = args.families or list(known)
+    if unknown := [n for n in names if n not in known]:
+        parser.error(f'no such family: {", ".join(unknown)}; there are {", ".join(known)}' + (' (and more with --real)' if unknown[0].startswith('real') else ''))
+    if args.plot and args.plot.suffix.lower() != '.png':
+        parser.error(f'--plot {args.plot}: only .png can be drawn')
+    for file in filter(None, (args.json, args.plot)):
+        if not file.absolute().parent.is_dir():
+            raise ToolError(f'{file}: there is no such folder')
+    if args.first_seed < 0:
+        parser.error(f'--first-seed {args.first_seed}: seeds count from 0')
+    if 'p' in names:
+        need('vtkmodules.vtkRenderingOpenGL2', 'vtk')
+    draw = need('fluoro_shape_ros.tools.bench_plot', 'plot').draw if args.plot else None
+    tasks = [Task(name, args.first_seed + k, tuple(dict.fromkeys(args.methods)), args.real) for name in dict.fromkeys(names) for k in range(args.scenes)]
+    trials = list(tqdm(attempts(tasks, args.jobs), total=len(tasks), unit='scene', disable=None))
+    found = rows(trials)
+    print(table(found))
     if args.json:
-        args.json.write_text(json.dumps({f'{f}/{m}': [_plain(a) for a in rows] for (f, m), rows in answers.items()}, indent=1))
+        args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'limits': LIMITS, 'rows': plain(found),
+                                         'trials': [_plain(t) for t in trials]}, indent=1) + '\n')
+    if draw:
+        draw(trials, args.plot)
     return 0
 
 
-def answer(scene, config: Config) -> Answer:
-    """What the pipeline says of one scene. The base's position is given, as a robot's user would."""
-    config = config.replace(robot_radius=scene.radius, base_position=scene.base_position.tolist())
-    result = reconstruct(scene.frame, config)
-    return Answer(scene.seed, result.outcome, compare(result.shape.points, scene.truth) if result.shape else None)
+LIMITS = {'within_mean_m': WITHIN_MEAN, 'within_tip_m': WITHIN_TIP, 'silent_mean_m': SILENT_MEAN, 'silent_tip_m': SILENT_TIP, 'honest_chi2': CHI2_95}
 
 
-def table(answers: dict[tuple[str, str], list[Answer]]) -> str:
-    """A row a family and method; errors of the answered scenes in mm as mean / 95th percentile / worst."""
-    columns = ('mean', 'missed', 'tip', 'length', 'matched')
-    lines = [f'{"family":12s} {"method":8s} {"answered":>9s} {"silent":>6s} ' + ' '.join(f'{c + " (mean/p95/max mm)":>25s}' for c in columns) + '  rejections']
-    for (family, method), rows in answers.items():
-        good = [a.errors for a in rows if a.errors]
-        cells = [_cell(np.array([getattr(e, c) for e in good]) * 1000) for c in columns]
-        reasons = Counter(a.outcome.value for a in rows if not a.errors)
-        lines.append(f'{family:12s} {method:8s} {len(good):4d}/{len(rows):4d} {sum(a.silent_failure for a in rows):6d} ' + ' '.join(cells)
-                     + '  ' + ', '.join(f'{n} {r}' for r, n in reasons.most_common()))
-    return '\n'.join(lines)
+def _plain(trial: Trial) -> dict:
+    """A trial for JSON."""
+    return {'family': trial.task.family, 'seed': trial.task.seed, 'note': next(iter(trial.answers.values())).note,
+            'bound_m': dataclasses.asdict(trial.bound) if trial.bound else None,
+            'answers': {method: _plain_answer(a) for method, a in trial.answers.items()}}
 
 
-def _cell(mm: np.ndarray) -> str:
-    return f'{"-":>25s}' if not len(mm) else f'{f"{mm.mean():.3f} / {np.percentile(mm, 95):.3f} / {mm.max():.3f}":>25s}'
+def _plain_answer(a: Answer) -> dict:
+    return {'outcome': a.outcome.value, 'detail': a.detail, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None,
+            'surprise': None if math.isnan(a.surprise) else min(a.surprise, 1e12), 'within': a.within, 'silent_failure': a.silent_failure}
 
 
-def _plain(a: Answer) -> dict:
-    return {'seed': a.seed, 'outcome': a.outcome.value, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None}
+def _count(text: str) -> int:
+    """A number of things, at least one."""
+    if (number := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f'{text}: at least one is needed')
+    return number
 
 
 if __name__ == '__main__':

@@ -1,13 +1,147 @@
-"""Families of seeded scenes with known truth, by name: what the benches report on."""
+"""Families of seeded scenes with known truth, by name: what the benches report on.
+
+ACCURACY scenes have nothing in them but the device, so that the Cramer-Rao bound applies. ROBUSTNESS scenes are X-ray images over anatomy
+(0.3 mm a pixel, planes 90 degrees apart, 1500 photons a pixel, 25 % contrast), each with one more difficulty.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
-from ..sim.scenes import Scene, protocol_p, xray_scene
+import cv2
+import numpy as np
 
-FAMILIES: dict[str, tuple[str, Callable[[int], Scene]]] = {
-    'p': ('protocol P of the seed, drawn by VTK', lambda seed: protocol_p(seed)),
-    'p_xray': ('protocol P, drawn by the X-ray renderer', lambda seed: protocol_p(seed, 'xray')),
-    'anatomy': ('X-ray over anatomy, 0.3 mm/px', lambda seed: xray_scene(seed)),
+from ..data import Frame
+from ..sim import carm, scenes, xray
+from ..sim.scenes import Run, Scene
+from .composites import composite
+
+HIDDEN_PX = 25.0                            # of the device, behind the occluder
+CALIBRATION_ERROR_PX = 0.5
+ANGLES = np.deg2rad((35.0, 125.0))          # between the planes
+LOW_DOSE = 150.0                            # photons a pixel
+MASK_FRAMES, MASK_SHIFT_PX = 8, 1.5         # frames averaged; the most that the patient has moved since, along u and v
+SHORT, LONG = (0.067, 0.150), (0.140, 0.188)    # m: fits the field of 0.2 mm/px; room for a loop
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, and what belongs to it."""
+
+    scene: Scene
+    masks: tuple[np.ndarray, np.ndarray] | None = None      # (H, W) float32 device-free images
+    note: str = ''                                          # what the seed has drawn
+    run: Run | None = None                                  # what a bound can be computed from
+
+
+@dataclass(frozen=True)
+class Family:
+    """Scenes of one kind."""
+
+    text: str
+    make: Callable[[int], Case]     # of a seed
+    device: bool = True             # False: no pair of images shows a device, so every published shape is wrong
+
+
+def families(real: Path | None = None) -> dict[str, Family]:
+    """All families by name; those on real backgrounds exist where their folder `real` is given."""
+    return ACCURACY | ROBUSTNESS | (on_real(real) if real else {})
+
+
+def on_real(folder: Path) -> dict[str, Family]:
+    """Families of composites on the backgrounds in `folder`; see composites.py."""
+    def case(seed: int, **options) -> Case:
+        return Case(*composite(seed, folder, **options))
+    return {
+        'real': Family('a device on real backgrounds', case),
+        'real_mask': Family('the same scenes, with a mask', lambda seed: case(seed, masked=True)),
+        'real_blank': Family('real backgrounds without a device', lambda seed: case(seed, device=False), device=False),
+    }
+
+
+def _bare(run: Run) -> Case:
+    return Case(run.scene(), run=run)
+
+
+def _xray(seed: int, *, pixel_size_iso: float = 0.3e-3, angle: float = np.pi / 2, photons: float = 1500.0, **options) -> Run:
+    views = carm.biplane(angle_b=(angle, 0.0), arm=carm.CArm(pixel_size_iso=pixel_size_iso))
+    return scenes.xray_run(seed, views=views, exposure=xray.Exposure(photons=photons), **options)
+
+
+def _rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng([seed, 6])     # apart from those that draw the scene
+
+
+def _cluttered(seed: int) -> Case:
+    clutter = ('leads', 'wire', 'text', ('blades', 'field')[seed % 2])
+    return Case(_xray(seed, clutter=clutter).scene(), note=', '.join(clutter))
+
+
+def _masked(seed: int) -> Case:
+    run, shifts = _xray(seed, clutter=('leads', 'wire')), _rng(seed).uniform(-MASK_SHIFT_PX, MASK_SHIFT_PX, (2, 2))
+    frames = [run.without_device(index=k + 1).images for k in range(MASK_FRAMES)]
+    means = [np.mean(images, axis=0, dtype=np.float32) for images in zip(*frames)]
+    moved = tuple(cv2.warpAffine(m, np.c_[np.eye(2), d], m.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE) for m, d in zip(means, shifts))
+    return Case(run.scene(), moved, 'masks moved by ' + ' and '.join(f'{np.linalg.norm(d):.1f} px' for d in shifts))
+
+
+def _angled(seed: int) -> Case:
+    angle = _rng(seed).uniform(*ANGLES)
+    return Case(_xray(seed, angle=angle).scene(), note=f'planes {np.rad2deg(angle):.0f} degrees apart')
+
+
+def _miscalibrated(seed: int) -> Case:
+    """The scene of the same seed of `anatomy`, but plane B's principal point is not quite where its calibration says."""
+    scene, turn = _xray(seed).scene(), _rng(seed).uniform(0, 2 * np.pi)
+    a, b = scene.frame.views
+    shift = np.array([np.cos(turn), np.sin(turn), 0.0]) * CALIBRATION_ERROR_PX
+    wrong = dataclasses.replace(b, P=b.P + np.outer(shift, b.P[2]))
+    frame = dataclasses.replace(scene.frame, views=(a, wrong))
+    return Case(dataclasses.replace(scene, frame=frame), note=f'plane b off by {shift[0]:.2f}, {shift[1]:.2f} px')
+
+
+def _plain_or_anatomy(seed: int) -> tuple[Run, str]:
+    """Three kinds of run in turn, and what they are."""
+    kind = seed // 2 % 3
+    if kind == 0:
+        return scenes.protocol_p_run(seed, 'xray'), 'protocol P'
+    return (_xray(seed), 'anatomy') if kind == 1 else (_xray(seed, clutter=('leads', 'text', 'blades')), 'anatomy, leads, text, blades')
+
+
+def _blank(seed: int) -> Case:
+    run, what = _plain_or_anatomy(seed)
+    return Case(dataclasses.replace(run.scene(), frame=run.without_device(index=1)), note=what)
+
+
+def _one_plane(seed: int) -> Case:
+    run, what = _plain_or_anatomy(seed)
+    scene, without = run.scene(), run.without_device(index=1)
+    seen = seed % 2
+    images = (scene.frame.images[0], without.images[1]) if seen == 0 else (without.images[0], scene.frame.images[1])
+    frame = Frame(scene.frame.stamp_ns, scene.frame.frame_id, images, scene.frame.views)
+    return Case(dataclasses.replace(scene, frame=frame), note=f'{what}; device in plane {"ab"[seen]} only')
+
+
+ACCURACY = {
+    'p': Family('protocol P of Burgner et al. 2011, drawn by VTK', lambda seed: _bare(scenes.protocol_p_run(seed))),
+    'p_xray': Family('protocol P, drawn by the X-ray renderer', lambda seed: _bare(scenes.protocol_p_run(seed, 'xray'))),
+    'xray_02': Family('X-ray at 0.2 mm a pixel', lambda seed: _bare(_xray(seed, anatomy=False, pixel_size_iso=0.2e-3, lengths=SHORT))),
+    'xray_03': Family('X-ray at 0.3 mm a pixel', lambda seed: _bare(_xray(seed, anatomy=False))),
+    'low_dose': Family('X-ray at 0.3 mm a pixel, a tenth of the dose', lambda seed: _bare(_xray(seed, anatomy=False, photons=LOW_DOSE))),
+}
+ROBUSTNESS = {
+    'anatomy': Family('ribs, spine, vessels, soft tissue', lambda seed: Case(_xray(seed).scene())),
+    'clutter': Family('and ECG leads, a second wire, text, blades or a circular field', _cluttered),
+    'masked': Family('leads and a second wire, with a mask of a patient who has moved', _masked),
+    'angles': Family('planes 35 to 125 degrees apart', _angled),
+    'tangent': Family('device tangent to its epipolar lines, which meet it twice', lambda seed: Case(_xray(seed, kind='tangent').scene())),
+    'crossing': Family('device crosses itself in an image', lambda seed: Case(_xray(seed, kind='crossing', lengths=LONG).scene())),
+    'occlusion': Family(f'{HIDDEN_PX:g} px of the device hidden in one plane', lambda seed: Case(_xray(seed, hidden_px=HIDDEN_PX).scene())),
+    'entering': Family('shaft comes in through the border', lambda seed: Case(_xray(seed, entering=True).scene())),
+    'calibration': Family(f'plane B\'s calibration off by {CALIBRATION_ERROR_PX:g} px; else the scenes of anatomy', _miscalibrated),
+    'blank': Family('no device', _blank, device=False),
+    'one_plane': Family('device in one plane only', _one_plane, device=False),
 }
