@@ -13,6 +13,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 RIDGE_Z = 3.5           # ridge points stand out from the noise by this many standard deviations ...
 BRANCH_Z = 5.0          # ... and branches by this, on average over their best half
 MAX_RIDGE_SHARE = 0.015 # of the pixels, at most: the strongest
+FEW_RIDGES = 16000      # pixels that are never too many
+FAINTEST = 0.01         # of the strongest ridge
+ONE_SIDED = 0.15        # the side that is less bright rises at least this much of the mean
 NMS_PX = 0.75           # a ridge point lies within this of its pixel's centre (0.5, and some for noise)
 KINK_PX = 6             # a branch that turns by more than this within so many points to either side is two lines that touch
 MAX_KINK = np.deg2rad(38)
@@ -51,12 +54,15 @@ def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float) -> Ridges:
     cv2.add(l2, cv2.add(uu, vv), dst=l2)                                    # 2 l2, the larger eigenvalue of the Hessian
     margin = int(3 * sigma)
     inside = cv2.erode(field, np.ones((2 * margin + 1,) * 2, np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    some = inside[::8, ::4] > 0
+    stride = 31 if image.shape[1] % 31 else 29      # no row or column is favoured: a device may lie along one
+    some = inside.ravel()[::stride] > 0
     if not some.any():
         return _no_ridges()
-    noise = np.sqrt(3) * 1.4826 * float(np.median(np.abs(uv[::8, ::4][some]))) + 1e-12  # white noise: Var(uu) = 3 Var(uv); of 2 l2
-    sample = l2[::8, ::4][some]
-    level = max(RIDGE_Z * noise, float(np.partition(sample, int((1 - MAX_RIDGE_SHARE) * len(sample)))[int((1 - MAX_RIDGE_SHARE) * len(sample))]))
+    noise = np.sqrt(3) * 1.4826 * float(np.median(np.abs(uv.ravel()[::stride][some]))) + 1e-12  # white noise: Var(uu) = 3 Var(uv); of 2 l2
+    sample = l2.ravel()[::stride][some]
+    enough = int((1 - min(max(MAX_RIDGE_SHARE, FEW_RIDGES / image.size), 0.9)) * len(sample))
+    faintest = FAINTEST * max(cv2.norm(l2, cv2.NORM_INF), float(smooth.max()) * 1e-3)           # without noise, rounding is no ridge
+    level = max(RIDGE_Z * noise, faintest, float(np.partition(sample, enough)[enough]))
     found = cv2.findNonZero(cv2.bitwise_and(cv2.compare(l2, level, cv2.CMP_GT), inside))
     if found is None:
         return _no_ridges()
@@ -73,6 +79,10 @@ def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float) -> Ridges:
     t = -(gu * nu + gv * nv) / strength
     du, dv = t * nu, t * nv
     keep = np.nonzero((np.abs(du) <= NMS_PX) & (np.abs(dv) <= NMS_PX) & (np.abs(i_uu + i_vv - strength) < 0.7 * strength))[0]
+    # a dark line is darker than both its sides; the foot of a bright line or of an edge is not
+    side = np.rint(2 * sigma * nv[keep]).astype(int) * w + np.rint(2 * sigma * nu[keep]).astype(int)
+    rise = np.stack([gray[at[keep] + side], gray[at[keep] - side]]) - gray[at[keep]]
+    keep = keep[rise.min(axis=0) > ONE_SIDED * rise.mean(axis=0)]
     # where two pixels side by side claim the ridge, the nearer one has it
     index = np.full(image.size, -1, np.int32)
     index[at[keep]] = np.arange(len(keep))

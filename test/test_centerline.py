@@ -51,8 +51,9 @@ def test_ridge_points_of_a_line_lie_on_it_and_in_its_order(p, q):
 
 def test_ridge_points_of_a_circle_lie_on_it():
     ridges = find_ridges(draw(np.abs(np.hypot(U - 120, V - 100) - 60)), FIELD, SIGMA)
-    assert len(ridges.z) > 300
-    assert np.abs(np.hypot(*(ridges.points_px - [120, 100]).T) - 60).max() < 0.1
+    strong = ridges.z > 8       # single points of the noise reach 3.5 standard deviations, as they must
+    assert strong.sum() > 300
+    assert np.abs(np.hypot(*(ridges.points_px[strong] - [120, 100]).T) - 60).max() < 0.1
 
 
 def test_a_ring_is_one_chain_that_goes_round_once():
