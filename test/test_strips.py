@@ -57,6 +57,14 @@ def test_a_known_offset_is_measured(direction, offset):
     assert_allclose(m.presence, 1, atol=0.03)
 
 
+def test_a_background_that_curves_changes_nothing():
+    image = draw((1, 0, 0), 0.1, noise=0.5)
+    bowl = (0.2 * (V - 120) ** 2).astype(np.float32)
+    flat, curved = (measure(strips, profile(strips)) for strips in (strips_of((1, 0, 0), i) for i in (image, image + bowl)))
+    assert_allclose(curved.offset_px, flat.offset_px, atol=1e-3)
+    assert_allclose(curved.variance, flat.variance, rtol=1e-2)
+
+
 def test_offsets_settle_where_strips_follow_them():
     # a start 1.5 px off: each measurement moves the strips, as the fit does
     at = 0.0
