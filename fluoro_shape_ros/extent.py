@@ -73,13 +73,13 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
             tried.append((cost, (slope**2).sum(axis=1) * weight, blur))
         return min(tried, key=lambda t: t[0].min())
 
-    end = guess + np.arange(-REACH_PX, REACH_PX + 0.01, 0.6) / px_per_m
-    coarse = {v: edges(v, end, BLURS_PX) for v in planes}
+    wide = end = guess + np.arange(-REACH_PX, REACH_PX + 0.01, 0.6) / px_per_m
+    coarse = {v: edges(v, wide, BLURS_PX) for v in planes}
     if planes:
-        best = end[np.argmin(sum(c[0] for c in coarse.values()))]
+        best = wide[np.argmin(sum(c[0] for c in coarse.values()))]
         end = best + np.arange(-1.0, 1.01, 0.1) / px_per_m
     fine = {v: edges(v, end, [coarse[v][2]]) for v in planes}
-    single = [(end[np.argmin(c)], 1 / np.sqrt(i[np.argmin(c)] + 1e-12)) for c, i, _ in fine.values()]
+    single = [(wide[np.argmin(c)], 1 / np.sqrt(i[np.argmin(c)] + 1e-12)) for c, i, _ in coarse.values()]
     cost, information = sum(f[0] for f in fine.values()), sum(f[1] for f in fine.values())
     if not single:
         return guess, float('inf')
@@ -90,6 +90,6 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     variance = 1 / (information[k] + 1e-12) + (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2
     if len(single) == 2:        # planes that disagree by more than noise: the truth lies somewhere between
         apart = abs(single[0][0] - single[1][0])
-        if apart > 3 * np.hypot(single[0][1], single[1][1]) + 0.7 / px_per_m:
+        if apart > 3 * np.hypot(single[0][1], single[1][1]) + 0.9 / px_per_m:
             variance += (apart / 2) ** 2
     return float(at), float(np.sqrt(variance))

@@ -183,9 +183,11 @@ def _cut_both(images, fields, views, spline: Spline3, s: np.ndarray, half_width,
 
 
 def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
-    """(2,) darkness that each plane shows just past strip `at`, as a share of the device's; NaN where that lies outside its field or the strips."""
+    """(2,) darkness that each plane shows just past strip `at`, as a share of the device's; NaN outside its field, 1 where the strips end before it does."""
     past = presence[at + 5:at + 22] if outward > 0 else presence[max(at - 21, 0):max(at - 4, 0)]
-    return np.median(past, axis=0) if len(past) >= 10 else np.full(2, np.nan)
+    if len(past) < 10:
+        return np.where(np.isnan(past).any(axis=0), np.nan, 1.0)
+    return np.median(past, axis=0)
 
 
 def _finish(solution: Solution, s, strips, seen, presence, reference, beyond, half_width, radius) -> Fit:

@@ -125,24 +125,26 @@ def backbone(f: Fit, forward: bool, step: float) -> Shape:
 
 
 def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
-    """The (H, W) image as float32 with a device that is darker than its surroundings; polarity is settled here and nowhere else."""
+    """The (H, W) image as float32, not negative, with a device that is darker than its surroundings; polarity is settled here and nowhere else."""
+    full = float(np.iinfo(image.dtype).max) if image.dtype.kind == 'u' else None
     image = image.astype(np.float32)
+    if full is None:
+        low, high = float(image.min()), float(image.max())
+        image, full = image - min(low, 0.0), high - min(low, 0.0)
     if polarity == 'auto':
         # a thin device is a rare deviation from the local level: the longer tail tells its sign
         detail = image - cv2.blur(image, (31, 31))
         polarity = 'bright' if np.mean(detail**3) > 0 else 'dark'
-    return float(image.max()) - image if polarity == 'bright' else image
+    return full - image if polarity == 'bright' else image
 
 
 def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] = (slice(None), slice(None))) -> np.ndarray:
     """(H, W) float32 square root of a dark device's image: quantum noise gets the same variance everywhere (Anscombe). 0 outside `region`."""
-    if region == (slice(None), slice(None)):
-        return cv2.sqrt(np.maximum(dark_device(image, polarity), 0))
     out = np.zeros(image.shape, np.float32)
-    if polarity != 'dark':      # needs the whole image's statistics
-        out[region] = np.sqrt(np.maximum(dark_device(image, polarity)[region], 0))
-    else:
-        out[region] = np.sqrt(np.maximum(image[region].astype(np.float32), 0))
+    if image.dtype.kind == 'u' and polarity != 'auto':
+        out[region] = np.sqrt(dark_device(image[region], polarity))
+    else:       # needs the whole image's statistics
+        out[region] = np.sqrt(dark_device(image, polarity)[region])
     return out
 
 

@@ -40,7 +40,7 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
 def check_tip(covariance: np.ndarray, config: Config) -> tuple[Outcome, str] | None:
     """Standard deviation of the tip in its worst direction, from its (3, 3) covariance in m^2: None, or the rejection."""
     limit = config.plausibility.max_tip_sigma
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])) if np.isfinite(covariance).all() else float('inf')
     if limit and not sigma <= limit:
         return Outcome.TIP_UNCERTAIN, f'tip sigma {sigma * 1000:.2f} mm exceeds {limit * 1000:.2f} mm'
     return None

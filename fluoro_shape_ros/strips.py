@@ -127,9 +127,9 @@ def measure(strips: Strips, profile: np.ndarray, reference: np.ndarray | None = 
     inside = strips.inside
     darkness = np.where(inside, -coefficients[:, 3], np.nan)
     usual = _running_median(darkness, inside if reference is None else inside & reference)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        offset = coefficients[:, 4] / usual
-    variance = noise**2 * (fit[4] @ fit[4]) / np.maximum(usual, 1e-9) ** 2
+    usual = np.where(usual > 1e-9, usual, np.nan)       # no darkness at all, or brighter than its surroundings: no device to measure
+    offset = coefficients[:, 4] / usual
+    variance = np.nan_to_num(noise**2 * (fit[4] @ fit[4]) / usual**2, nan=np.inf)
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
     misfit = uniform_filter1d(np.minimum((rest**2).sum(axis=1) / (len(x) - 5), 9 * noise**2), TOGETHER) / noise**2
     variance = variance * (1 + TOGETHER * np.maximum(misfit - MISFIT, 0))
