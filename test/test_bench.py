@@ -30,8 +30,8 @@ def found(mean_mm, tip_mm, surprise=float('nan'), seed=0):
     return Answer(seed, Outcome.OK, errors=errors(mean_mm, tip_mm), surprise=surprise)
 
 
-GIVEN = [found(0.1, 0.5, 1.0), found(0.3, 1.0, 7.8), found(0.32, 0.1, 7.9), found(0.1, 1.1), found(1.2, 0.1), found(0.1, 2.5), Answer(6, Outcome.CURVATURE),
-         Answer(7, Outcome.CURVATURE), Answer(8, Outcome.LENGTH)]
+GIVEN = [found(0.1, 0.5, 1.0), found(0.3, 1.0, 7.8), found(0.32, 0.1, 7.9), found(0.1, 1.1), found(1.2, 0.1), found(0.1, 2.5),
+         Answer(6, Outcome.CURVATURE), Answer(7, Outcome.CURVATURE), Answer(8, Outcome.LENGTH)]
 
 
 def test_row_counts_what_is_good_wrong_and_honest():
@@ -57,8 +57,8 @@ def test_table_has_a_line_a_family_and_method():
     assert shares[0].split() == 'p spline 9 67 % 22 % 2 67 % 2 curvature_too_high, 1 length_out_of_bounds'.split()
     assert shares[1].split() == 'paper 9 0 % 0 % 0 - 9 no_device_in_plane_a'.split()
     assert shares[2].split() == 'blank spline 1 0 % - 0 - 1 no_device_in_plane_b'.split()
-    assert errors_mm[0][:5] == ['p', 'spline', '0.353', '0.980', '1.200'] and errors_mm[1] == ['bound', '0.020', '0.020', '0.020', '-', '0.100', '0.100',
-                                                                                              '0.100', '0.090', '0.090', '0.090', '-']
+    assert errors_mm[0][:5] == ['p', 'spline', '0.353', '0.980', '1.200']
+    assert errors_mm[1] == ['bound', *['0.020'] * 3, '-', *['0.100'] * 3, *['0.090'] * 3, '-']
     assert lines[-2:] == ['spline: 2 silent failures in 10 scenes (20.0 %)', 'paper: 0 silent failures in 10 scenes (0.0 %)']
 
 
@@ -112,7 +112,8 @@ def test_answer_gives_what_a_user_knows_and_measures_what_comes(monkeypatch):
 def test_accuracy_is_written_as_json_and_does_not_depend_on_the_number_of_jobs(tmp_path, capfd):
     def run(jobs):
         file = tmp_path / f'{jobs}.json'
-        assert bench.main(['accuracy', '--families', 'p_xray', '--methods', 'spline', '--scenes', '2', '--first-seed', '7', '--jobs', str(jobs), '--json', str(file)]) == 0
+        assert bench.main(['accuracy', '--families', 'p_xray', '--methods', 'spline', '--scenes', '2', '--first-seed', '7', '--jobs', str(jobs),
+                           '--json', str(file)]) == 0
         return file.read_text(), capfd.readouterr().out
 
     (text, out), (text_of_two, out_of_two) = run(1), run(2)

@@ -12,7 +12,7 @@ from fluoro_shape_ros.tools import bound
 PITCH, LENGTH, RADIUS, BLUR, CONTRAST, PHOTONS = 0.5e-3, 0.05, 0.0004, 2.0, 0.01, 1000.0
 VIEWS = carm.biplane(arm=carm.CArm(pixel_size_iso=PITCH, width=160, height=160))
 # nearly along z, across both beams, but leaning enough to meet pixels at all phases
-HEADING = Rotation.align_vectors([[0.08, 0.06, 1.0]], [[1.0, 0.0, 0.0]])[0].as_matrix()
+HEADING = Rotation.from_rotvec([0.0, -np.pi / 2 + 0.08, 0.06]).as_matrix()
 POSE = shapes.Pose(-HEADING[:, 0] * LENGTH / 2, HEADING)
 
 

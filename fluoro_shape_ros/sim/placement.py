@@ -88,8 +88,9 @@ def turns_back(points: np.ndarray, views: tuple[View, View]) -> bool:
     their epipolar lines, and beside it the lines meet the device twice."""
     rising = _across(points, *views) > 0
     aside = _clear_steps(points)
-    turns = [k for k in range(aside, len(rising) - aside + 1) if (rising[k - aside:k] != rising[k]).all() and (rising[k:k + aside] == rising[k]).all()]
-    return bool(turns) and well_seen(points, views, HARD_EPIPOLAR_SHARE)
+    steady = [len(set(rising[k:k + aside])) == 1 for k in range(len(rising) - aside + 1)]
+    turns = any(steady[k] and steady[k + aside] and rising[k] != rising[k + aside] for k in range(len(steady) - aside))
+    return turns and well_seen(points, views, HARD_EPIPOLAR_SHARE)
 
 
 def crosses_itself(points: np.ndarray, views: tuple[View, View]) -> bool:
@@ -138,7 +139,8 @@ def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
     tightest = np.hypot(*(loop.angles()(s, 1) * np.c_[np.cos(loop.angles()(s)[:, 1]), np.ones(500)]).T).max()
     loop = shapes.centred(rng, shapes.Spline(length, np.c_[yaw * shapes.MAX_CURVATURE / tightest, pitch]))
     axis, beam = loop.pose.heading[:, 2], views[rng.integers(2)].P[2, :3] + rng.normal(0, 0.3, 3)
-    turn = Rotation.align_vectors([beam], [axis])[0].as_matrix()     # about the origin, which the shape stands at
+    about = np.cross(axis, beam)
+    turn = Rotation.from_rotvec(about / np.linalg.norm(about) * np.arctan2(np.linalg.norm(about), axis @ beam)).as_matrix()
     return dataclasses.replace(loop, pose=shapes.Pose(turn @ loop.pose.base, turn @ loop.pose.heading))
 
 

@@ -34,12 +34,15 @@ def main(argv=None) -> int:
 def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
     """A command that prints the table of `families`."""
     epilog = 'families:\n' + '\n'.join(f'  {n:12s} {f.text}' for n, f in families.items())
-    command = commands.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command = commands.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument('--families', nargs='+', metavar='NAME', help='(default: all)')
-    command.add_argument('--methods', nargs='+', metavar='METHOD', choices=METHODS, default=list(METHODS), help=f'of {", ".join(METHODS)} (default: all)')
+    command.add_argument('--methods', nargs='+', metavar='METHOD', choices=METHODS, default=list(METHODS),
+                         help=f'of {", ".join(METHODS)} (default: all)')
     command.add_argument('--scenes', type=_count, default=20, metavar='N', help='scenes of each family (default: 20)')
     command.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
-    command.add_argument('--jobs', type=_count, default=2, metavar='N', help='processes of one thread each; the table does not depend on it (default: 2)')
+    command.add_argument('--jobs', type=_count, default=2, metavar='N',
+                         help='processes of one thread each; the table does not depend on it (default: 2)')
     command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every scene\'s answers there, in m')
     command.add_argument('--plot', type=Path, metavar='FILE.png', help='draw errors and shares')
     command.set_defaults(body=_tables, group=families, real=None)
@@ -53,7 +56,8 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
     known = args.group | (on_real(args.real) if args.real else {})
     names = args.families or list(known)
     if unknown := [n for n in names if n not in known]:
-        parser.error(f'no such family: {", ".join(unknown)}; there are {", ".join(known)}' + (' (and more with --real)' if unknown[0].startswith('real') else ''))
+        hint = ' (and more with --real)' if unknown[0].startswith('real') else ''
+        parser.error(f'no such family: {", ".join(unknown)}; there are {", ".join(known)}{hint}')
     if args.plot and args.plot.suffix.lower() != '.png':
         parser.error(f'--plot {args.plot}: only .png can be drawn')
     for file in filter(None, (args.json, args.plot)):
@@ -64,7 +68,8 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
     if 'p' in names:
         need('vtkmodules.vtkRenderingOpenGL2', 'vtk')
     draw = need('fluoro_shape_ros.tools.bench_plot', 'plot').draw if args.plot else None
-    tasks = [Task(name, args.first_seed + k, tuple(dict.fromkeys(args.methods)), args.real) for name in dict.fromkeys(names) for k in range(args.scenes)]
+    methods = tuple(dict.fromkeys(args.methods))
+    tasks = [Task(name, args.first_seed + k, methods, args.real) for name in dict.fromkeys(names) for k in range(args.scenes)]
     trials = list(tqdm(attempts(tasks, args.jobs), total=len(tasks), unit='scene', disable=None))
     found = rows(trials)
     print(table(found))

@@ -96,8 +96,10 @@ def _legends(figure, axes, methods, top: float) -> None:
     from matplotlib.patches import Patch
     marks = [Line2D([], [], ls='', marker='o', ms=5, color=COLOURS[m % len(COLOURS)], label=f'{method}: a scene') for m, method in enumerate(methods)]
     marks += [Line2D([], [], color=TRUTH, marker='o', ms=5, lw=1.2, label='median to 95th percentile'),
-              Line2D([], [], color='#7ee081', lw=2, label='Cramér-Rao bound'), Line2D([], [], color=TEXT, lw=0.8, ls='--', label='limit of "within"')]
+              Line2D([], [], color='#7ee081', lw=2, label='Cramér-Rao bound'),
+              Line2D([], [], color=TEXT, lw=0.8, ls='--', label='limit of "within"')]
     row = dict(loc='lower left', frameon=False, fontsize=10, borderaxespad=0.0, handletextpad=0.5, columnspacing=1.6)
     y = 1 - top * 0.8
     figure.legend(handles=marks, ncol=len(marks), bbox_to_anchor=(axes[0].get_position().x0, y), **row)
-    figure.legend(handles=[Patch(color=colour, label=label) for label, colour, _ in SHARES], ncol=2, bbox_to_anchor=(axes[2].get_position().x0, y), **row)
+    patches = [Patch(color=colour, label=label) for label, colour, _ in SHARES]
+    figure.legend(handles=patches, ncol=2, bbox_to_anchor=(axes[2].get_position().x0, y), **row)

@@ -66,8 +66,10 @@ def row(answers: list[Answer]) -> Row:
     """What the answers of one method come to."""
     reasons = Counter(a.outcome.value for a in answers if not a.published)
     known = [a for a in answers if not np.isnan(a.surprise)]
-    return Row(len(answers), any(a.device for a in answers), sum(a.published for a in answers), sum(a.within for a in answers),
-               sum(a.silent_failure for a in answers), len(known), sum(a.surprise <= CHI2_95 for a in known), dict(reasons.most_common()), _stats([a.errors for a in answers if a.errors]))
+    return Row(scenes=len(answers), device=any(a.device for a in answers), answered=sum(a.published for a in answers),
+               within=sum(a.within for a in answers), silent=sum(a.silent_failure for a in answers), reported=len(known),
+               honest=sum(a.surprise <= CHI2_95 for a in known), rejections=dict(reasons.most_common()),
+               errors=_stats([a.errors for a in answers if a.errors]))
 
 
 def table(found: dict[tuple[str, str], Row]) -> str:

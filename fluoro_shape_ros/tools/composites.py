@@ -67,7 +67,9 @@ def composite(seed: int, folder: Path, device: bool = True, masked: bool = False
     noise = rng.uniform(*NOISE)
     shares = [xray.blurred(xray.transmission(whole, RADIUS, v, exposure), exposure) if device else 1.0 for v in real.views]
     images = tuple(_noisy(image * share, noise, rng) for image, share in zip(real.images, shares))
-    masks = tuple(np.mean([_noisy(image, noise, rng) for _ in range(MASK_FRAMES)], axis=0, dtype=np.float32) for image in real.images) if masked else None
+    masks = None
+    if masked:
+        masks = tuple(np.mean([_noisy(image, noise, rng) for _ in range(MASK_FRAMES)], axis=0, dtype=np.float32) for image in real.images)
     truth = placement.seen_in_both(whole, real.fields)
     return Scene(Frame(0, FRAME_ID, images, real.views), truth, RADIUS, truth[0], 'composite', seed), masks
 

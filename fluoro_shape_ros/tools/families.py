@@ -84,8 +84,12 @@ def _masked(seed: int) -> Case:
     run, shifts = _xray(seed, clutter=('leads', 'wire')), _rng(seed).uniform(-MASK_SHIFT_PX, MASK_SHIFT_PX, (2, 2))
     frames = [run.without_device(index=k + 1).images for k in range(MASK_FRAMES)]
     means = [np.mean(images, axis=0, dtype=np.float32) for images in zip(*frames)]
-    moved = tuple(cv2.warpAffine(m, np.c_[np.eye(2), d], m.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE) for m, d in zip(means, shifts))
-    return Case(run.scene(), moved, 'masks moved by ' + ' and '.join(f'{np.linalg.norm(d):.1f} px' for d in shifts))
+    masks = tuple(_moved(mean, shift) for mean, shift in zip(means, shifts))
+    return Case(run.scene(), masks, 'masks moved by ' + ' and '.join(f'{np.linalg.norm(d):.1f} px' for d in shifts))
+
+
+def _moved(image: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
+    return cv2.warpAffine(image, np.c_[np.eye(2), shift_px], image.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _angled(seed: int) -> Case:
