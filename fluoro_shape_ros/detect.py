@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from .centerline import Candidate, find_candidates, find_ridges, ridge_scale
 from .data import Outcome
-from .fit import Fit, contrast_ratio, fit, shown
+from .fit import Fit, continues, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
 from .start import first_curve
@@ -72,7 +72,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
 def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
     fitted = fit(images, fields, views, points, radius, coarse=1)
-    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start):
+    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
         return None
     ends = np.linspace(fitted.start, fitted.stop, 100)
     return Detection(fitted, Outcome.OK, 'ok', tuple(distort(v, project(v.P, fitted.spline(ends))) for v in views))

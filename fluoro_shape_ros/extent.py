@@ -14,6 +14,7 @@ SMOOTH_PX = 9
 REACH_PX = 12.0         # the edge is looked for this far around the first guess
 BLURS_PX = (0.8, 1.1, 1.5, 2.2)
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
+RAMP = 0.1
 FLOOR_PX = 0.12         # what the model of the edge itself is worth
 
 
@@ -47,11 +48,12 @@ def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.n
     return np.maximum(opaque, 0.5 * (1 - 2 * half_dark)) * radius * np.sqrt(1 - sine**2) / sine
 
 
-def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: float, outward: int, beyond: np.ndarray) -> tuple[float, float]:
+def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: float, outward: int, beyond: np.ndarray,
+           ramp: float = 0.0) -> tuple[float, float]:
     """Arc length (m) where the device ends, and its standard deviation (m).
 
     s: (N,) m. presence: (N, 2), sigma: (2,) its noise, speed: (N, 2) px per m. outward: +1 for the end at large s, -1 at small.
-    beyond: (2,) m, see `bulge`. Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both
+    beyond: (2,) m, see `bulge`. ramp: m over which the end fades in the more foreshortened plane; its model is worth RAMP of that. Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both
     planes, residuals clipped at 3.5 sigma.
     """
     here = int(np.argmin(np.abs(s - guess)))
@@ -87,7 +89,7 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     left, middle, right = cost[k - 1:k + 2]
     bow = left - 2 * middle + right
     at = end[k] + (0.5 * (left - right) / bow * (end[1] - end[0]) if bow > 0 else 0.0)
-    variance = 1 / (information[k] + 1e-12) + (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2
+    variance = 1 / (information[k] + 1e-12) + (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2 + (RAMP * ramp) ** 2
     if len(single) == 2:        # planes that disagree by more than noise: the truth lies somewhere between
         apart = abs(single[0][0] - single[1][0])
         if apart > 3 * np.hypot(single[0][1], single[1][1]) + 0.9 / px_per_m:

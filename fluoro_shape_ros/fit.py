@@ -23,6 +23,7 @@ WIDE_PX = 8.0           # extra reach of the strips while the start is still rou
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
 NEAR_END_PX = 8
 GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
+ASIDE = 0.6             # darkness beside the extension of a fit, as a share of the device's, that makes a tracked fit suspect
 GOES_ON = 0.25          # darkness beyond an end, as a share of the usual, that makes one look farther
 BEND_SIGMA = 3e-3 / 0.01**3     # 1/m^2: typical change of curvature along a device (third differences of 3 mm at control points 10 mm apart)
 SLIDE = 1e-4             # m: images do not see a curve slide along itself, so no step may
@@ -210,7 +211,8 @@ def _finish(solution: Solution, s, strips, seen, presence, reference, beyond, ha
             dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
             ends[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
             continue
-        ends[k], end_sigma[k] = locate(s, presence, sigma, speed, reference[k], outward, bulge(radius, speed[i], scale, across))
+        ends[k], end_sigma[k] = locate(s, presence, sigma, speed, reference[k], outward, bulge(radius, speed[i], scale, across),
+                                       radius / float(np.tan(np.arcsin(np.clip(speed[i] / scale, 0.1, 1.0))).min()))
     covariance = np.linalg.inv(solution.information)
     return Fit(solution.spline, ends[0], ends[1], end_sigma, open_end, covariance, s, presence, solution.offset_px, contrast, across, alike, np.nan_to_num(beyond))
 
@@ -229,3 +231,19 @@ def shown(f: Fit) -> np.ndarray:
 def contrast_ratio(f: Fit) -> float:
     """How many times as dark one plane shows the device as the other, at least 1: as seen for an opaque device, as if straight on for a translucent one."""
     return float(min(c.max() / max(c.min(), 1e-6) for c in (f.contrast, f.across)))
+
+
+def continues(images, fields, views, f: Fit, radius: float) -> bool:
+    """Whether the device goes on beside the fit's ends, where the curve may have lost it: a line as dark as the device within WIDE_PX, in either plane."""
+    step = f.s[1] - f.s[0]
+    half_width = [radius * pixels_per_metre(v.P, f.spline(np.array([f.start, f.stop]))) for v in views]
+    for k, (end, outward) in enumerate(((f.start, -1), (f.stop, 1))):
+        if f.open_end[k]:
+            continue
+        px = np.arange(-80, 20)
+        strips = _cut_both(images, fields, views, f.spline, end + outward * px * step, half_width, WIDE_PX)
+        for t, h in zip(strips, half_width):
+            line = search(t, shadow(h, np.arange(-half_width_range(h), half_width_range(h) + 1)))
+            if np.median(line.presence[(px > 6) & (px < 18)]) > ASIDE:
+                return True
+    return False

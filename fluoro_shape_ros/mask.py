@@ -27,7 +27,16 @@ def shift_between(mask: np.ndarray, image: np.ndarray) -> tuple[float, float]:
     """u, v in px by which the scene of (H, W) `mask` has moved in `image`; 0, 0 where no believable shift is found."""
     small = [cv2.resize(i.astype(np.float32), None, fx=1 / SHRINK, fy=1 / SHRINK, interpolation=cv2.INTER_AREA) for i in (mask, image)]
     small = [i - cv2.GaussianBlur(i, (0, 0), 8) for i in small]
+    h, w = (_even_dft_size(n) for n in small[0].shape)      # phaseCorrelate pads to a DFT size and errs by half a pixel where that is odd
+    small = [np.ascontiguousarray(i[:h, :w]) for i in small]
     (du, dv), response = cv2.phaseCorrelate(*small, cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F))
     if response < 0.05 or max(abs(du), abs(dv)) * SHRINK > MAX_SHIFT_PX:
         return 0.0, 0.0
     return du * SHRINK, dv * SHRINK
+
+
+def _even_dft_size(n: int) -> int:
+    """The largest even size up to n that the DFT takes as it is."""
+    while n % 2 or cv2.getOptimalDFTSize(n) != n:
+        n -= 1
+    return n
