@@ -53,8 +53,9 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     """Arc length (m) where the device ends, and its standard deviation (m).
 
     s: (N,) m. presence: (N, 2), sigma: (2,) its noise, speed: (N, 2) px per m. outward: +1 for the end at large s, -1 at small.
-    beyond: (2,) m, see `bulge`. ramp: m over which the end fades in the more foreshortened plane; its model is worth RAMP of that. Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both
-    planes, residuals clipped at 3.5 sigma.
+    beyond: (2,) m, see `bulge`. ramp: m over which the end fades in the more foreshortened plane; its model is worth RAMP of that.
+    Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
+    clipped at 3.5 sigma.
     """
     here = int(np.argmin(np.abs(s - guess)))
     px_per_m = np.mean(speed[here])

@@ -13,7 +13,7 @@ from .config import ConfigError, fields
 from .tools import cli
 
 PROG = 'fluoro_shape_node'
-ROS_PACKAGES = ('rclpy', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_srvs')
+ROS_PACKAGES = ('rclpy', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_srvs', 'visualization_msgs')
 STOP_S = 1.0    # for the pair at work when the node is told to end
 
 
@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
         PROG, usage=f'{PROG} [-h] [--ros-args -p PARAMETER:=VALUE ... -r TOPIC:=OTHER ...]', formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Reconstruct backbone and tip of a continuum device from two synchronized fluoroscopy streams.\n\n'
                     'Listens to plane_a/image_raw, plane_a/camera_info, plane_b/image_raw, plane_b/camera_info, predicted_backbone;\n'
-                    'publishes backbone, tip, /diagnostics; serves ~/reset, ~/enable, ~/capture_mask, ~/clear_mask.',
+                    'publishes backbone, tip, tip_pose, backbone_points, markers, plane_a/overlay, plane_b/overlay, /diagnostics; serves ~/reset, ~/enable, ~/capture_mask, ~/clear_mask.',
         epilog='parameters:\n' + '\n'.join(lines))
 
 
@@ -82,8 +82,9 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     try:
         if not told_to_stop.is_set():   # it may have come before rclpy's handlers
             executor.spin()
-    except ExternalShutdownException:
-        pass
+    except (ExternalShutdownException, rclpy_implementation.RCLError):
+        if rclpy.ok():      # else the signal came between rclpy's look at the context and its use
+            raise
     finally:
         ended = node.stop(STOP_S)
         rclpy.try_shutdown()

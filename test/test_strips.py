@@ -123,7 +123,8 @@ def test_strips_follow_a_distorted_image():
     known = strips_of((1, 0, 0.6), image, view=bent)
     assert np.abs(measure(known, profile(known)).offset_px - 0.1).max() < 0.05
     ignored = strips_of((1, 0, 0.6), image)
-    assert np.abs(measure(ignored, profile(ignored)).offset_px - 0.1).max() > 0.3
+    found = measure(ignored, profile(ignored))
+    assert not (np.isfinite(found.variance) & (np.abs(found.offset_px - 0.1) < 0.3)).all()
 
 
 @pytest.mark.parametrize('offset', [-7, 0, 6])
