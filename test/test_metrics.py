@@ -19,6 +19,12 @@ def test_shifted_aside():
     assert_allclose(e.length, 0, atol=1e-9)
 
 
+def test_a_few_micrometres_aside_are_no_more():
+    """Also where the samples of the curves stand side by side at half a step."""
+    e = compare(LINE + [0.025e-3, 2e-6, 0], LINE)
+    assert_allclose([e.mean, e.missed], 2e-6, rtol=1e-2)
+
+
 def test_tip_cut_off():
     e = compare(LINE[:9], LINE)                     # 20 of 100 mm missing
     assert_allclose([e.tip, e.length, e.worst, e.matched], 0.02, rtol=1e-2)

@@ -67,7 +67,8 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
         parser.error(f'--first-seed {args.first_seed}: seeds count from 0')
     if 'p' in names:
         need('vtkmodules.vtkRenderingOpenGL2', 'vtk')
-    draw = need('fluoro_shape_ros.tools.bench_plot', 'plot').draw if args.plot else None
+    if args.plot:
+        need('matplotlib', 'plot')
     methods = tuple(dict.fromkeys(args.methods))
     tasks = [Task(name, args.first_seed + k, methods, args.real) for name in dict.fromkeys(names) for k in range(args.scenes)]
     trials = list(tqdm(attempts(tasks, args.jobs), total=len(tasks), unit='scene', disable=None))
@@ -76,7 +77,8 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
     if args.json:
         args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'limits': LIMITS, 'rows': plain(found),
                                          'trials': [_plain(t) for t in trials]}, indent=1) + '\n')
-    if draw:
+    if args.plot:
+        from .bench_plot import draw    # imports matplotlib
         draw(trials, args.plot)
     return 0
 
