@@ -50,7 +50,8 @@ def _parser() -> argparse.ArgumentParser:
         PROG, usage=f'{PROG} [-h] [--ros-args -p PARAMETER:=VALUE ... -r TOPIC:=OTHER ...]', formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Reconstruct backbone and tip of a continuum device from two synchronized fluoroscopy streams.\n\n'
                     'Listens to plane_a/image_raw, plane_a/camera_info, plane_b/image_raw, plane_b/camera_info, predicted_backbone;\n'
-                    'publishes backbone, tip, tip_pose, backbone_points, markers, plane_a/overlay, plane_b/overlay, /diagnostics; serves ~/reset, ~/enable, ~/capture_mask, ~/clear_mask.',
+                    'publishes backbone, tip, tip_pose, backbone_points, markers, plane_a/overlay, plane_b/overlay, /diagnostics;\n'
+                    'serves ~/reset, ~/enable, ~/capture_mask, ~/clear_mask.',
         epilog='parameters:\n' + '\n'.join(lines))
 
 
