@@ -73,6 +73,8 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
         rclpy.try_shutdown()
         return _refuse(error)
     except RuntimeError as error:   # rclpy has no type of its own for arguments that it can't parse
+        if 'context is invalid' in str(error):      # a signal has shut it down while the node was being made
+            return 0
         rclpy.try_shutdown()
         message = re.sub(r',? at \S+:\d+', '', str(error))     # without places in ROS's sources
         if 'parse' not in message:

@@ -14,7 +14,7 @@ from fluoro_shape_ros.data import Outcome, Reconstruction, Shape
 from fluoro_shape_ros.geometry import decompose, project, source
 from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.sim import carm, scenes
-from fluoro_shape_ros.tools import bench, bench_table, composites, families, trial
+from fluoro_shape_ros.tools import bench, bench_table, composites, families, speed, trial
 from fluoro_shape_ros.tools.bound import Bound
 from fluoro_shape_ros.tools.cli import ToolError
 from fluoro_shape_ros.tools.trial import Answer, Task, Trial
@@ -261,3 +261,14 @@ def test_bad_folders_are_named(real, tmp_path_factory):
         composites.load(real)
     with pytest.raises(ToolError, match='background_plane_a.png'):
         composites.load(tmp_path_factory.mktemp('empty'))
+
+
+def test_speed_is_printed_full_and_tracked(capsys):
+    assert bench.main(['speed', '--sizes', '512', '--scenes', '1', '--rounds', '1']) == 0
+    full, tracked = capsys.readouterr().out.splitlines()[1:]
+    assert 'spline, full' in full and 'detect' in full and 'spline, tracked' in tracked and 'track' in tracked
+
+
+def test_what_is_wrong_is_not_timed():
+    with pytest.raises(ToolError, match='paper.*(mm off|none of 1)'):
+        speed.times(speed.scenes(512, 1, 0), 'paper', False, 1)

@@ -1,4 +1,4 @@
-"""fluoro_shape_bench: how accurate and how robust the reconstruction is, on seeded scenes with known truth."""
+"""fluoro_shape_bench: how accurate, how robust and how fast the reconstruction is, on seeded scenes with known truth."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, on_real
+from .speed import report
 from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
 METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
@@ -22,13 +23,25 @@ METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
 
 def main(argv=None) -> int:
     """The command line. A command adds itself to the parser and says which function of (args, parser) is its body."""
-    parser = argparse.ArgumentParser('fluoro_shape_bench', description='Tables of accuracy and robustness on seeded scenes with known truth.')
+    parser = argparse.ArgumentParser('fluoro_shape_bench', description='Tables of accuracy, robustness and speed on seeded scenes with known truth.')
     commands = parser.add_subparsers(dest='command', required=True)
     _add_tables(commands, 'accuracy', 'nothing but the device in the images, beside the Cramer-Rao bound', ACCURACY)
     robustness = _add_tables(commands, 'robustness', 'one difficulty at a time, and scenes where nothing may be published', ROBUSTNESS)
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
+    timing = commands.add_parser('speed', help='how long a pair takes, checked against truth, beside a yardstick timed in the same run')
+    timing.add_argument('--sizes', type=_count, nargs='+', default=[512, 1024, 2048], metavar='PX', help='image sizes (default: 512 1024 2048)')
+    timing.add_argument('--scenes', type=_count, default=5, metavar='N', help='anatomy scenes of each size (default: 5)')
+    timing.add_argument('--rounds', type=_count, default=10, metavar='N', help='how often each is timed (default: 10)')
+    timing.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    timing.set_defaults(body=_speed)
     return run(lambda args: args.body(args, parser), parser, argv)
+
+
+def _speed(args, parser: argparse.ArgumentParser) -> int:
+    """Print the table of times."""
+    print(report(args.sizes, args.scenes, args.rounds, args.first_seed))
+    return 0
 
 
 def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
