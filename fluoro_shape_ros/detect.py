@@ -21,6 +21,7 @@ CANDIDATES = 6          # most device-like ones among them that are compared bet
 HOPELESS = 0.03         # ... unless they are that much less like it than the best
 HYPOTHESES = 4          # alignments that are fitted before one is chosen
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
+LENIENT = 0.25          # the same where no other line competes: robot_radius may be off by a third
 UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
 EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.85    # less of a line than this, and it is another line or only a part of the device is fitted
@@ -72,7 +73,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
 def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
     fitted = fit(images, fields, views, points, radius, coarse=1)
-    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
+    if fitted is None or evidence(fitted, LENIENT) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
         return None
     ends = np.linspace(fitted.start, fitted.stop, 100)
     return Detection(fitted, Outcome.OK, 'ok', tuple(distort(v, project(v.P, fitted.spline(ends))) for v in views))
@@ -106,11 +107,11 @@ def explained(f: Fit, view, line_px: np.ndarray, visible: np.ndarray) -> float:
     return float(near[counted].mean()) if counted.any() else 0.0
 
 
-def evidence(f: Fit) -> float:
+def evidence(f: Fit, unlike: float = UNLIKE) -> float:
     """How much speaks for a fit: a device looks like a cylinder of its radius, is seen all along and equally dark by both planes, and stops in both at once."""
     if f.contrast.min() <= 0:
         return 0.0
     alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * np.exp((np.clip(f.likeness, 0, 1).mean() - 1) / UNLIKE))
+    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * np.exp((np.clip(f.likeness, 0, 1).mean() - 1) / unlike))

@@ -7,15 +7,15 @@ import numpy as np
 from .config import Config
 from .curve import curvature
 from .data import Outcome
-from .detect import evidence
+from .detect import LENIENT, evidence
 from .fit import Fit, contrast_ratio, shown
 
-MIN_LIKENESS = 0.88     # correlation of the profile seen with a cylinder's of robot_radius, in the worse plane
+MIN_LIKENESS = 0.86     # correlation of the profile seen with a cylinder's of robot_radius, in the worse plane
 MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
 MIN_CONTRAST = 0.02
-MIN_EVIDENCE = 0.2      # see detect.evidence, for a length of 1 m
+MIN_EVIDENCE = 0.4      # see detect.evidence, for a length of 1 m
 
 
 def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
@@ -36,7 +36,7 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
-    if evidence(f) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
+    if evidence(f, LENIENT) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
         return Outcome.POORLY_EXPLAINED, 'too little speaks for it being one device in both planes (likeness, darkness, ends)'
     return None
 
