@@ -191,3 +191,11 @@ def test_source_is_where_path_length_looks_from():
     towards = source(FINE[0].P) / np.linalg.norm(source(FINE[0].P))
     spans = [np.ptp(np.flatnonzero(xray.path_length(rod((0, 0, 1), centre=towards * d), RADIUS, FINE[0])[:, 199])) for d in (0.0, 0.2)]
     assert spans[1] / spans[0] == pytest.approx(0.81 / (0.81 - 0.2), rel=0.02)
+
+
+def test_without_any_opengl_vtk_says_so_and_does_not_crash(monkeypatch):
+    pytest.importorskip('vtkmodules.vtkRenderingOpenGL2')
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.setattr(vtk_scene, '_loads', lambda library: False)     # no machine can be without its libraries for one test
+    with pytest.raises(vtk_scene.NoOpenGL, match='libEGL'):
+        vtk_scene.coverage(rod((1, 0, 0)), RADIUS, FINE[0])

@@ -5,6 +5,7 @@ It shares nothing with `xray` but the View: the tube is a surface here, and a vo
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 
@@ -19,6 +20,8 @@ SIDES = 32          # of the tube: its mean width is 0.3 % below the circle's
 SUPERSAMPLING = 4   # VTK's edges are hard: so many samples a pixel and axis make them area fractions ...
 # ... taken once for each of these shifts (u, v in samples), so that an edge along an axis is met at 16 places a pixel, not at 4
 SHIFTS = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
+
+NO_OPENGL = 'the VTK renderer finds no OpenGL: it needs a display, or libEGL with a (software) driver'
 
 
 class NoOpenGL(OSError):
@@ -143,9 +146,20 @@ def _offscreen_window():
     from vtkmodules import vtkRenderingOpenGL2
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
     headless = sys.platform.startswith('linux') and not os.environ.get('DISPLAY')
+    if headless and not any(map(_loads, ('libEGL.so.1', 'libOSMesa.so.8', 'libOSMesa.so'))):     # VTK crashes instead of saying so
+        raise NoOpenGL(NO_OPENGL)
     # asked for by name, since VTK's own search tries X first and complains aloud
     window = vtkRenderingOpenGL2.vtkEGLRenderWindow() if headless and hasattr(vtkRenderingOpenGL2, 'vtkEGLRenderWindow') else vtkRenderWindow()
     window.SetOffScreenRendering(True)
     if not window.SupportsOpenGL():
-        raise NoOpenGL('the VTK renderer finds no OpenGL: it needs a display, or libEGL with a (software) driver')
+        raise NoOpenGL(NO_OPENGL)
     return window
+
+
+def _loads(library: str) -> bool:
+    """Whether the system has a shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
