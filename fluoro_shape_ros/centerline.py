@@ -33,11 +33,6 @@ class Ridges:
     start: np.ndarray       # (B + 1,) branch b is start[b]:start[b + 1]
 
 
-def smooth_noise_free(image: np.ndarray) -> np.ndarray:
-    """Square root of the counts: quantum noise gets the same variance everywhere (Anscombe)."""
-    return cv2.sqrt(np.maximum(image - min(0.0, float(image.min())), 0))
-
-
 def ridge_scale(half_width_px: float) -> float:
     """sigma in px of the smoothing that fits a cylinder's shadow of this half width, blurred by about 0.8 px."""
     return max(1.2, 1.2 * float(np.hypot(0.5 * half_width_px, 0.8)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
 
 
 def arc_length(points: np.ndarray) -> np.ndarray:
@@ -42,3 +43,11 @@ def curvature(points: np.ndarray) -> np.ndarray:
     c = points[2:] - points[:-2]
     sides = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1) * np.linalg.norm(c, axis=1)
     return 2 * np.linalg.norm(np.cross(a, b), axis=1) / np.maximum(sides, 1e-30)
+
+
+def distance_to(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """(N,) distance of (N, d) points to the nearer of the two segments of the (M, d) polyline that meet at its nearest vertex."""
+    near = np.clip(cKDTree(line).query(points)[1][:, None] + [-1, 0], 0, len(line) - 2)
+    segment, rel = line[near + 1] - line[near], points[:, None] - line[near]
+    t = np.clip((rel * segment).sum(-1) / np.maximum((segment * segment).sum(-1), 1e-30), 0, 1)
+    return np.linalg.norm(rel - t[..., None] * segment, axis=-1).min(axis=1)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from .curve import arc_length, resample
+from .curve import arc_length, distance_to, resample
 
 DENSE = 0.05e-3     # m: both curves are sampled this finely
 
@@ -27,18 +26,10 @@ class Errors:
 def compare(points: np.ndarray, truth: np.ndarray) -> Errors:
     """Errors of (N, 3) backbone points against the (M, 3) true backbone, both base to tip, m."""
     found, true = _dense(points), _dense(truth)
-    to_true, to_found = _distance(found, true), _distance(true, found)
+    to_true, to_found = distance_to(found, true), distance_to(true, found)
     n = min(len(found), len(true))
     return Errors(float(to_true.mean()), float(to_found.mean()), float(max(to_true.max(), to_found.max())), float(np.linalg.norm(found[-1] - true[-1])),
                   abs(float(arc_length(found)[-1] - arc_length(true)[-1])), float(np.linalg.norm(found[-n:] - true[-n:], axis=1).mean()))
-
-
-def _distance(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
-    """(N,) distance of (N, 3) points to the nearest segment of the (M, 3) polyline: its samples alone are up to DENSE / 2 farther away."""
-    near = np.clip(cKDTree(curve).query(points)[1][:, None] + [-1, 0], 0, len(curve) - 2)       # the two segments at the nearest sample
-    segment, rel = curve[near + 1] - curve[near], points[:, None] - curve[near]
-    t = np.clip(np.einsum('nki,nki->nk', rel, segment) / np.einsum('nki,nki->nk', segment, segment), 0, 1)
-    return np.linalg.norm(rel - t[..., None] * segment, axis=2).min(axis=1)
 
 
 def _dense(points: np.ndarray) -> np.ndarray:

@@ -6,11 +6,10 @@ import time
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from . import paper
 from .config import Config
-from .curve import arc_length, even_steps, resample
+from .curve import arc_length, distance_to, even_steps, resample
 from .data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
 from .detect import detect, track
 from .ends import tip_is_last
@@ -158,16 +157,7 @@ def region_around(view, points: np.ndarray) -> tuple[slice, slice]:
 
 def residuals_px(points: np.ndarray, views, centerlines) -> np.ndarray:
     """(N, 2) distance in px of the reprojected (N, 3) points to the centreline seen in each plane."""
-    return np.stack([_distance_to_polyline(project(v.P, points), undistort(v, line.points_px)) for v, line in zip(views, centerlines)], axis=1)
-
-
-def _distance_to_polyline(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """(N,) distance of (N, 2) points to the nearest segment of the (M, 2) polyline."""
-    a, d = line[:-1], np.diff(line, axis=0)
-    near = np.clip(cKDTree(line).query(points)[1][:, None] + [-1, 0], 0, len(a) - 1)     # the two segments at the nearest vertex
-    rel = points[:, None] - a[near]
-    t = np.clip((rel * d[near]).sum(-1) / np.maximum((d[near] ** 2).sum(-1), 1e-30), 0, 1)
-    return np.linalg.norm(rel - t[..., None] * d[near], axis=-1).min(axis=1)
+    return np.stack([distance_to(project(v.P, points), undistort(v, line.points_px)) for v, line in zip(views, centerlines)], axis=1)
 
 
 def _centerline(points_px: np.ndarray, field: np.ndarray, half_width_px: float) -> Centerline | None:

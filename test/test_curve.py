@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.curve import arc_length, at_arc_length, curvature, even_steps, resample
+from fluoro_shape_ros.curve import arc_length, at_arc_length, curvature, distance_to, even_steps, resample
 
 
 def circle(radius, angle, n):
@@ -38,3 +38,8 @@ def test_resampling_two_points_is_a_straight_line():
 def test_curvature_of_a_circle_and_of_a_line():
     assert_allclose(curvature(circle(0.05, 1.0, 30)), 20, rtol=1e-9)
     assert_allclose(curvature(np.outer(np.arange(5.0), [1, 2, 3])), 0, atol=1e-12)
+
+
+def test_distance_to_a_polyline_by_hand():
+    corner = np.array([[0.0, 0], [10, 0], [10, 10]])
+    assert_allclose(distance_to(np.array([[4.0, 3], [12, 5], [13, -4], [-3, 4]]), corner), [3, 2, 5, 5])
