@@ -64,6 +64,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     from rclpy.qos_overriding_options import InvalidQosOverridesError
 
     from .ros_node import FluoroShapeNode
+    from .transforms import TfMissing
     try:
         rclpy.init(args=argv)
         node = FluoroShapeNode()
@@ -72,6 +73,9 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     except (ConfigError, InvalidQosOverridesError) as error:
         rclpy.try_shutdown()
         return _refuse(error)
+    except TfMissing as error:
+        rclpy.try_shutdown()
+        raise cli.ToolError(error) from error
     except RuntimeError as error:   # rclpy has no type of its own for arguments that it can't parse
         if 'context is invalid' in str(error):      # a signal has shut it down while the node was being made
             return 0

@@ -27,7 +27,8 @@ from .data import Frame, Outcome, Reconstruction
 from .outputs import Outputs
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
-from .subscriptions import AdaptiveSubscription, transform_lookup
+from .subscriptions import AdaptiveSubscription
+from .transforms import TfMissing, import_tf, transform_lookup
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
@@ -37,7 +38,7 @@ PATIENCE_S = 0.2        # for a camera info that should come with its image
 class FluoroShapeNode(Node):
     """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread reconstructs and publishes.
 
-    Raises ConfigError where a parameter given at the start can't work.
+    Raises ConfigError where a parameter given at the start can't work, and TfMissing where it asks for tf and there is none.
     """
 
     def __init__(self):
@@ -193,8 +194,9 @@ class FluoroShapeNode(Node):
 
     def _on_check_parameters(self, parameters) -> SetParametersResult:
         try:
-            params.changed(self._config, parameters)
-        except ConfigError as error:
+            if params.changed(self._config, parameters).input.geometry == 'tf':
+                import_tf()
+        except (ConfigError, TfMissing) as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 

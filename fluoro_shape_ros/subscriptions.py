@@ -1,19 +1,14 @@
-"""What the node listens to: subscriptions that take what a publisher offers, and poses from tf."""
+"""What the node listens to: subscriptions that take what a publisher offers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
-from rclpy.time import Time
-from scipy.spatial.transform import Rotation
-
-from .worker import Lookup, NoTransform
 
 RELIABILITIES = ('auto', 'reliable', 'best_effort')
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
@@ -80,30 +75,3 @@ def _reliability(node: Node, topic: str, image_reliability: str) -> str:
     if value not in RELIABILITIES:
         raise InvalidQosOverridesError(f'{name}: must be one of {", ".join(RELIABILITIES)}, got {value!r}')
     return image_reliability if value == 'auto' else value
-
-
-def transform_lookup(node: Node) -> Lookup:
-    """A function (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples, from tf2.
-
-    It raises NoTransform, also where tf2_ros is not installed.
-    """
-    try:
-        import tf2_ros
-    except ImportError as error:
-        missing = f'geometry:=tf needs tf2_ros, which is not installed here ({error})'
-
-        def unknown(reference: str, camera: str, stamp_ns: int):
-            raise NoTransform(missing)
-        return unknown
-    buffer = tf2_ros.Buffer()
-    buffer.listener = tf2_ros.TransformListener(buffer, node)   # lives as long as the buffer
-
-    def lookup(reference: str, camera: str, stamp_ns: int):
-        try:
-            t = buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns)).transform
-        except tf2_ros.TransformException as error:
-            raise NoTransform(f'{camera} from {reference}: {error}') from error
-        q, p = t.rotation, t.translation
-        R = Rotation.from_quat(np.array([q.x, q.y, q.z, q.w])).as_matrix()
-        return tuple(map(tuple, R.tolist())), (p.x, p.y, p.z)
-    return lookup

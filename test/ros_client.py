@@ -40,13 +40,30 @@ def curve():
 BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])     # so that the tip is no guess
 
 
-def projection(angle_deg, size=SIZE):
-    """(3, 4) P of a source 0.8 m from the origin that looks at it horizontally; 1 px is 1 mm there."""
+def intrinsics(size=SIZE):
+    """(3, 3) K of an image whose pixels are 1 mm at 0.8 m."""
+    return np.array([[800.0, 0, (size - 1) / 2], [0, 800.0, (size - 1) / 2], [0, 0, 1]])
+
+
+def pose(angle_deg):
+    """R, t of camera_from_reference of a source 0.8 m from the origin that looks at it horizontally."""
     a = np.deg2rad(angle_deg)
     forward = np.array([np.sin(a), np.cos(a), 0.0])
     right = np.cross(forward, [0, 0, 1.0])
-    K = np.array([[800.0, 0, (size - 1) / 2], [0, 800.0, (size - 1) / 2], [0, 0, 1]])
-    return K @ np.c_[np.stack([right, np.cross(forward, right), forward]), [0, 0, 0.8]]
+    return np.stack([right, np.cross(forward, right), forward]), np.array([0, 0, 0.8])
+
+
+def projection(angle_deg, size=SIZE):
+    """(3, 4) P at `pose`."""
+    return intrinsics(size) @ np.c_[pose(angle_deg)]
+
+
+def pose_at(plane, stamp_ns):
+    """`pose` of plane 'a' or 'b' of a C-arm that turns by 20 degrees a second."""
+    return pose(20 * stamp_ns / 1e9 + {'a': 0, 'b': 90}[plane])
+
+
+K = intrinsics()
 
 
 def draw(P, size=SIZE, device=True):
@@ -85,7 +102,7 @@ def png_msg(pixels):
 
 def info_msg(P, size=SIZE, **fields):
     """A CameraInfo with full P; `fields` override."""
-    values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5, k=[800.0, 0, size / 2, 0, 800.0, size / 2, 0, 0, 1],
+    values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5, k=intrinsics(size).ravel().tolist(),
                   r=np.eye(3).ravel().tolist(), p=P.ravel().tolist())
     return CameraInfo(**{**values, **fields})
 

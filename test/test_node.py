@@ -1,5 +1,7 @@
 """The node on real topics."""
 
+import importlib.util
+
 import numpy as np
 import pytest
 
@@ -231,12 +233,19 @@ def test_compressed_images(client):
     assert client.connected()
 
 
+@pytest.mark.skipif(importlib.util.find_spec('tf2_ros') is None, reason='tf2_ros is not installed')
 def test_a_pose_that_tf_does_not_know_is_named(client):
     assert client.set('geometry', 'tf').successful
     stamp = client.send_pixels(GOOD)
     assert client.hears('no_transform')
     assert client.set('geometry', 'camera_info').successful
     assert client.connected() and client.good() and stamp not in client.paths
+
+
+@pytest.mark.skipif(importlib.util.find_spec('tf2_ros') is not None, reason='tf2_ros is installed')
+def test_tf_is_refused_where_it_is_not_installed(client):
+    result = client.set('geometry', 'tf')
+    assert not result.successful and 'needs tf2_ros, which is not installed' in result.reason
 
 
 def test_a_best_effort_publisher_is_heard(node, stream):

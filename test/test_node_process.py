@@ -3,7 +3,9 @@
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -64,6 +66,36 @@ def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
         assert client.connected() and client.insist(lambda: client.paths), node.log
         assert client.value('reconstruction', 'count internal_error') == '2'
         assert node.log.count('Traceback') == 1 and 'IndexError' in node.log
+
+
+def test_poses_of_moving_planes_come_from_tf(log):
+    """tf2_ros, which PyPI does not have, is stood in for; its poses turn with the stamps."""
+    code = f"""if True:
+        import sys
+        from types import SimpleNamespace as Fields
+        sys.path.insert(0, {str(Path(ros.__file__).parent)!r})
+        import ros_client
+        from fluoro_shape_ros.node import main
+        from scipy.spatial.transform import Rotation
+        class Buffer:
+            def lookup_transform(self, camera, reference, time, timeout):
+                assert reference == 'cell'
+                R, t = ros_client.pose_at(camera[len('plane_')], time.nanoseconds)
+                vector = lambda names, values: Fields(**dict(zip(names, values)))
+                return Fields(transform=Fields(rotation=vector('xyzw', Rotation.from_matrix(R).as_quat()), translation=vector('xyz', t)))
+        sys.modules['tf2_ros'] = Fields(Buffer=Buffer, TransformListener=lambda buffer, node: node, TransformException=LookupError)
+        sys.exit(main())"""
+    parameters = ('geometry:=tf', 'reference_frame:=cell', BASE, ros.RADIUS)
+    with NodeProcess(log, *parameters, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+        assert client.connected() and client.insist(lambda: any('no_device' in s.message for s in client.statuses), pair=ros.BLANK), node.log
+        for _ in range(2):
+            client.now_ns += 10**9
+            stamps = [client.now_ns + ros.STEP_NS, client.now_ns + ros.STEP_NS + 5_000_000]
+            poses = [np.c_[ros.pose_at(plane, stamp)] for plane, stamp in zip('ab', stamps)]
+            infos = [ros.info_msg(np.c_[ros.K, [0.0, 0, 0]]) for _ in poses]
+            path, _ = client.answer(client.send_pixels([ros.draw(ros.K @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))
+            assert path.header.frame_id == 'cell'
+            assert np.linalg.norm(ros.points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < 0.0025
 
 
 def run(*arguments, code=None):
