@@ -63,9 +63,6 @@ def pose_at(plane, stamp_ns):
     return pose(20 * stamp_ns / 1e9 + {'a': 0, 'b': 90}[plane])
 
 
-K = intrinsics()
-
-
 def draw(P, size=SIZE, device=True):
     """(size, size) uint8: a dark blurred line on a bright, even background."""
     image = np.full((size, size), 180, np.uint8)

@@ -87,13 +87,14 @@ def test_poses_of_moving_planes_come_from_tf(log):
         sys.exit(main())"""
     parameters = ('geometry:=tf', 'reference_frame:=cell', BASE, ros.RADIUS)
     with NodeProcess(log, *parameters, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
-        assert client.connected() and client.insist(lambda: any('no_device' in s.message for s in client.statuses), pair=ros.BLANK), node.log
+        infos = [ros.info_msg(np.c_[ros.intrinsics(), np.zeros(3)]) for _ in 'ab']
+        heard = lambda: any('no_device' in s.message for s in client.statuses)      # noqa: E731
+        assert client.connected() and client.insist(heard, pair=ros.BLANK, infos=infos), node.log
         for _ in range(2):
             client.now_ns += 10**9
             stamps = [client.now_ns + ros.STEP_NS, client.now_ns + ros.STEP_NS + 5_000_000]
             poses = [np.c_[ros.pose_at(plane, stamp)] for plane, stamp in zip('ab', stamps)]
-            infos = [ros.info_msg(np.c_[ros.K, [0.0, 0, 0]]) for _ in poses]
-            path, _ = client.answer(client.send_pixels([ros.draw(ros.K @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))
+            path, _ = client.answer(client.send_pixels([ros.draw(ros.intrinsics() @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))
             assert path.header.frame_id == 'cell'
             assert np.linalg.norm(ros.points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < 0.0025
 
