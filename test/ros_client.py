@@ -65,10 +65,15 @@ def pose_at(plane, stamp_ns):
 
 def draw(P, size=SIZE, device=True):
     """(size, size) uint8: a dark blurred line on a bright, even background."""
+    x = np.c_[curve(), np.ones(600)] @ P.T
+    return draw_pixels(x[:, :2] / x[:, 2:], size, device)
+
+
+def draw_pixels(points_px, size=SIZE, device=True):
+    """The same line through (N, 2) pixels."""
     image = np.full((size, size), 180, np.uint8)
     if device:
-        x = np.c_[curve(), np.ones(600)] @ P.T
-        cv2.polylines(image, [np.round(x[:, :2] / x[:, 2:] * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
+        cv2.polylines(image, [np.round(points_px * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
     return cv2.GaussianBlur(image, (5, 5), 0)
 
 
@@ -94,7 +99,7 @@ def image_msg(pixels, **fields):
 
 
 def png_msg(pixels):
-    return CompressedImage(format='png', data=bytes_of(cv2.imencode('.png', pixels)[1].tobytes()))
+    return CompressedImage(format='mono8; png compressed ', data=bytes_of(cv2.imencode('.png', pixels)[1].tobytes()))
 
 
 def info_msg(P, size=SIZE, **fields):

@@ -2,6 +2,7 @@
 
 import importlib.util
 
+import cv2
 import numpy as np
 import pytest
 
@@ -222,10 +223,40 @@ def test_a_bad_prediction_is_named(client):
     assert client.answer(client.send_pixels(GOOD))
 
 
+def test_16_bits_in_either_byte_order(client):
+    for big in (0, 1):
+        pair = [(pixels.astype(np.uint16) * 16).astype('>u2' if big else '<u2') for pixels in GOOD]     # 12 bits: the low byte alone says nothing
+        stamp = client.send([image_msg(pixels, encoding='mono16', is_bigendian=big, step=2 * SIZE) for pixels in pair])
+        path, _ = client.answer(stamp)
+        assert np.linalg.norm(points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < TOLERANCE
+
+
+def test_distortion_is_removed_unless_the_images_are_rectified(client):
+    """The image as received is some 8 px off P's, and bent; K and D tell."""
+    K, D = ros.intrinsics() + [[0, 0, 8], [0, 0, -6], [0, 0, 0]], np.array([-4.0, 0, 0.01, -0.01, 0])
+    infos, pair = [], []
+    for angle in (0, 90):
+        R, t = ros.pose(angle)
+        infos.append(info_msg(ros.projection(angle), k=K.ravel(), d=D))
+        pair.append(ros.draw_pixels(cv2.projectPoints(ros.curve(), cv2.Rodrigues(R)[0], t, K, D)[0][:, 0]))
+    for rectified in (False, True):
+        assert client.set('rectified', rectified).successful
+        path, _ = client.answer(client.send_pixels(pair, infos=infos))
+        error = np.linalg.norm(points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max()
+        assert error > 0.005 if rectified else error < TOLERANCE
+    assert client.set('rectified', False).successful
+
+
+def jpeg_msg(pixels):
+    return ros.CompressedImage(format='mono8; jpeg compressed ', data=ros.bytes_of(cv2.imencode('.jpg', pixels)[1].tobytes()))
+
+
 def test_compressed_images(client):
     assert client.set('image_transport', 'compressed').successful
     with Client(compressed=True, start_ns=client.now_ns) as other:
         assert other.connected() and other.good()
+        assert other.answer(other.send([jpeg_msg(pixels) for pixels in GOOD]))
+        assert other.answer(other.send([ros.png_msg(pixels.astype(np.uint16) * 16) for pixels in GOOD]))
         other.send([ros.png_msg(GOOD[0]), ros.CompressedImage(format='png', data=[1, 2, 3])])
         assert other.hears('bad_image', 'plane b')
         client.now_ns = other.now_ns
