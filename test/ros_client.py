@@ -16,10 +16,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import Parameter as ParameterMsg
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
@@ -117,9 +117,9 @@ def points(path):
 class NodeProcess:
     """fluoro_shape_node in a process of its own; ends with the block."""
 
-    def __init__(self, log, *parameters, code=None, domain=DOMAIN):
+    def __init__(self, log, *parameters, code=None, arguments=(), domain=DOMAIN):
         start = ['-m', 'fluoro_shape_ros.node'] if code is None else ['-c', code]
-        arguments = ['--ros-args', *(word for p in parameters for word in ('-p', p))]
+        arguments = ['--ros-args', *arguments, *(word for p in parameters for word in ('-p', p))]
         self._log = log
         self.process = subprocess.Popen([sys.executable, *start, *arguments], stdout=log.open('w'), stderr=subprocess.STDOUT,
                                         env={**os.environ, 'ROS_DOMAIN_ID': str(domain)})
@@ -247,7 +247,7 @@ class Client:
     def call(self, kind, name, request):
         client = self.node.create_client(kind, name)
         try:
-            assert client.wait_for_service(20)
+            assert client.wait_for_service(60)
             future = client.call_async(request)
             assert self.until(future.done)
             return future.result()
@@ -256,6 +256,11 @@ class Client:
 
     def trigger(self, name):
         return self.call(Trigger, f'/fluoro_shape/{name}', Trigger.Request())
+
+    def get(self, *names, node='/fluoro_shape'):
+        """The values of parameters."""
+        values = self.call(GetParameters, f'{node}/get_parameters', GetParameters.Request(names=names)).values
+        return [parameter_value_to_python(value) for value in values]
 
     def set(self, name, value=None, type_=None):
         """The result of setting a parameter."""

@@ -1,5 +1,6 @@
 """The node's process: how it starts and ends, and what it survives."""
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ pytest.importorskip('rclpy')
 
 import ros_client as ros                        # noqa: E402
 from ros_client import BASE, Client, NodeProcess    # noqa: E402
+
+from fluoro_shape_ros.resources import resource_path    # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -97,6 +100,22 @@ def test_poses_of_moving_planes_come_from_tf(log):
             path, _ = client.answer(client.send_pixels([ros.draw(ros.intrinsics() @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))
             assert path.header.frame_id == 'cell'
             assert np.linalg.norm(ros.points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < 0.0025
+
+
+def test_parameter_files_that_are_installed(tmp_path):
+    """Each in a node of its own, in a namespace of its own."""
+    yaml = pytest.importorskip('yaml')
+    with contextlib.ExitStack() as stack:
+        nodes, given = {}, {}
+        for name in ('defaults', 'preset_needle', 'preset_catheter', 'preset_concentric_tube'):
+            file = resource_path(f'{name}.yaml')
+            given[name] = yaml.safe_load(file.read_text())['/**']['ros__parameters']
+            arguments = ['--params-file', str(file), '-r', f'__ns:=/{name}']
+            nodes[name] = stack.enter_context(NodeProcess(tmp_path / f'{name}.txt', arguments=arguments, domain=ros.OTHER))
+        client = stack.enter_context(Client(domain=ros.OTHER))
+        for name, values in given.items():
+            taken = client.get(*values, node=f'/{name}/fluoro_shape')
+            assert [list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)] == list(values.values()), name
 
 
 def run(*arguments, code=None):
