@@ -27,7 +27,7 @@ from .data import Frame, Outcome, Reconstruction
 from .outputs import Outputs
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
-from .subscriptions import AdaptiveSubscription
+from .subscriptions import AdaptiveSubscription, unheard
 from .transforms import TfMissing, import_tf, transform_lookup
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
@@ -247,7 +247,7 @@ class FluoroShapeNode(Node):
 
     def _statuses(self) -> list:
         gap = self._pairer.gap_ns
-        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None,
+        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, unheard=partial(unheard, self._inputs, plane),
                                     reliability='best_effort' if self._inputs[f'image {plane}'].best_effort else 'reliable',
                                     fell_back=self._inputs[f'image {plane}'].fell_back) for plane in PLANES]
         pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)

@@ -38,6 +38,16 @@ class AdaptiveSubscription:
         """Whether best-effort is in use because of a publisher, not because anybody wanted it."""
         return self._auto and self.best_effort
 
+    @property
+    def topic(self) -> str:
+        """The full name, remapped."""
+        return self._subscription.topic_name
+
+    @property
+    def publishers(self) -> int:
+        """How many there are, compatible or not."""
+        return self._node.count_publishers(self.topic)
+
     def destroy(self) -> None:
         self._node.destroy_subscription(self._subscription)
 
@@ -75,3 +85,8 @@ def _reliability(node: Node, topic: str, image_reliability: str) -> str:
     if value not in RELIABILITIES:
         raise InvalidQosOverridesError(f'{name}: must be one of {", ".join(RELIABILITIES)}, got {value!r}')
     return image_reliability if value == 'auto' else value
+
+
+def unheard(subscriptions: dict[str, AdaptiveSubscription], plane: str) -> str:
+    """The topics of a plane that nobody publishes, in words; empty where all are published."""
+    return ' and '.join(s.topic for s in (subscriptions[f'image {plane}'], subscriptions[f'camera info {plane}']) if not s.publishers)

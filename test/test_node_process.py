@@ -116,6 +116,7 @@ def test_parameter_files_that_are_installed(tmp_path):
         for name, values in given.items():
             taken = client.get(*values, node=f'/{name}/fluoro_shape')
             assert [list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)] == list(values.values()), name
+        assert client.hears('no image yet: nobody publishes /defaults/plane_a/image_raw and /defaults/plane_a/camera_info')
 
 
 def run(*arguments, code=None):
