@@ -1,6 +1,7 @@
 """What must agree across files, what must work without ROS, and what every executable does with --help and nonsense."""
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 
 from fluoro_shape_ros import resources
 from fluoro_shape_ros.config import constraint, fields
+from fluoro_shape_ros.data import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
 PROFILE = 'fastdds_large_images.xml'
@@ -74,6 +76,17 @@ def test_readme_lists_every_parameter_as_it_is():
 
 def test_the_file_of_defaults_is_true():
     assert resources.resource_path('defaults.yaml').read_text() == defaults_file(), 'python test/test_package.py writes it'
+
+
+def test_troubleshooting_names_every_rejection():
+    text = (ROOT / 'README.md').read_text(encoding='utf-8').split('## Troubleshooting\n')[1].split('\n## ')[0]
+    assert [o.value for o in Outcome if o is not Outcome.OK and f'`{o.value}' not in text] == []
+
+
+def test_what_readme_and_docs_link_to_exists():
+    for page in (ROOT / 'README.md', ROOT / 'docs' / 'connect.md'):
+        targets = re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', page.read_text(encoding='utf-8'))
+        assert targets and [t for t in targets if not (page.parent / t).exists()] == [], page
 
 
 def parameter_table() -> str:
