@@ -28,7 +28,7 @@ from .outputs import Outputs
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
 from .subscriptions import AdaptiveSubscription, unheard
-from .transforms import TfMissing, import_tf, transform_lookup
+from .transforms import TfMissing, TfPoses, import_tf
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
@@ -81,7 +81,7 @@ class FluoroShapeNode(Node):
             old.destroy()
         given = self._config.input
         if given.geometry == 'tf' and self._lookup is None:
-            self._lookup = transform_lookup(self)
+            self._lookup = TfPoses(self)
         # camera infos first: the executor takes them in this order, and an image needs its camera
         for plane in PLANES:
             self._inputs[f'camera info {plane}'] = AdaptiveSubscription(
@@ -108,6 +108,8 @@ class FluoroShapeNode(Node):
             self._forget()
             for book in self._books.values():
                 book.rewind(stamp)
+            if self._lookup is not None:
+                self._lookup.forget()
         if pair is not None:
             self._tally.event('pair')
             self._drop(self._held is not None)

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 
-from .worker import Lookup, NoTransform
+from .worker import NoTransform
 
 PATIENCE_S = 0.1    # for a pose that is published a little later than the image it belongs to
 
@@ -27,23 +27,28 @@ def import_tf():
         raise TfMissing(f'geometry: tf needs tf2_ros, which is not installed here ({error}); it comes with ROS 2 (package tf2_ros_py), not from PyPI') from error
 
 
-def transform_lookup(node: Node) -> Lookup:
-    """A function (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples, from what tf tells `node`.
+class TfPoses:
+    """What tf tells `node` of poses: a Lookup, (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples.
 
-    It waits up to PATIENCE_S for a pose to come, so it may not be called from the node's own executor, and raises NoTransform. Raises TfMissing.
+    It waits up to PATIENCE_S for a pose to come, so it may not be called from the node's own executor, and raises NoTransform. Making it raises TfMissing.
     """
-    tf2_ros = import_tf()
-    buffer = tf2_ros.Buffer()
-    buffer.listener = tf2_ros.TransformListener(buffer, node)   # lives as long as the buffer
 
-    def lookup(reference: str, camera: str, stamp_ns: int):
+    def __init__(self, node: Node):
+        self._tf2_ros = import_tf()
+        self._buffer = self._tf2_ros.Buffer()
+        self._listener = self._tf2_ros.TransformListener(self._buffer, node)
+
+    def __call__(self, reference: str, camera: str, stamp_ns: int) -> tuple:
         if not camera:
             raise NoTransform('CameraInfo has no frame_id to look up')
         try:
-            t = buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns), Duration(seconds=PATIENCE_S)).transform
-        except tf2_ros.TransformException as error:
+            t = self._buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns), Duration(seconds=PATIENCE_S)).transform
+        except self._tf2_ros.TransformException as error:
             raise NoTransform(f'{camera} from {reference}: {error}') from error
         q, p = t.rotation, t.translation
         R = Rotation.from_quat(np.array([q.x, q.y, q.z, q.w])).as_matrix()
         return tuple(map(tuple, R.tolist())), (p.x, p.y, p.z)
-    return lookup
+
+    def forget(self) -> None:
+        """Forget poses that change with time: tf takes none that are older than what it has, as they are after a bag has looped."""
+        self._buffer.clear()

@@ -81,10 +81,16 @@ def test_poses_of_moving_planes_come_from_tf(log):
         from fluoro_shape_ros.node import main
         from scipy.spatial.transform import Rotation
         class Buffer:
+            known_to = 0
+            def clear(self):
+                self.known_to = 0
             def lookup_transform(self, camera, reference, time, timeout):
                 assert reference == 'cell'
                 R, t = ros_client.pose_at(camera[len('plane_')], time.nanoseconds)
                 vector = lambda names, values: Fields(**dict(zip(names, values)))
+                if self.known_to > time.nanoseconds + 10**9:
+                    raise LookupError('the pose is too old')    # as tf has it until it is cleared
+                self.known_to = max(self.known_to, time.nanoseconds)
                 return Fields(transform=Fields(rotation=vector('xyzw', Rotation.from_matrix(R).as_quat()), translation=vector('xyz', t)))
         sys.modules['tf2_ros'] = Fields(Buffer=Buffer, TransformListener=lambda buffer, node: node, TransformException=LookupError)
         sys.exit(main())"""
@@ -93,8 +99,10 @@ def test_poses_of_moving_planes_come_from_tf(log):
         infos = [ros.info_msg(np.c_[ros.intrinsics(), np.zeros(3)]) for _ in 'ab']
         heard = lambda: any('no_device' in s.message for s in client.statuses)      # noqa: E731
         assert client.connected() and client.insist(heard, pair=ros.BLANK, infos=infos), node.log
-        for _ in range(2):
-            client.now_ns += 10**9
+        for step_s in (1, 1, -5):
+            client.now_ns += step_s * 10**9
+            if step_s < 0:      # as a bag that loops
+                client.send_pixels(ros.BLANK, infos=infos)
             stamps = [client.now_ns + ros.STEP_NS, client.now_ns + ros.STEP_NS + 5_000_000]
             poses = [np.c_[ros.pose_at(plane, stamp)] for plane, stamp in zip('ab', stamps)]
             path, _ = client.answer(client.send_pixels([ros.draw(ros.intrinsics() @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))

@@ -113,9 +113,9 @@ class StandIn:
 
 def test_what_is_asked_of_tf2(monkeypatch):
     pytest.importorskip('rclpy')
-    from fluoro_shape_ros.transforms import transform_lookup
+    from fluoro_shape_ros.transforms import TfPoses
     monkeypatch.setitem(sys.modules, 'tf2_ros', StandIn())
-    lookup = transform_lookup('the node')
+    lookup = TfPoses('the node')
     R, t = lookup(REFERENCE, 'plane_a_optical', 2 * SECOND)
     expected = turning(REFERENCE, 'plane_a_optical', 2 * SECOND)
     assert np.allclose(R, expected[0]) and np.allclose(t, expected[1])
@@ -133,10 +133,10 @@ def test_a_real_buffer_interpolates_between_poses(monkeypatch):
     from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
     from std_msgs.msg import Header
 
-    from fluoro_shape_ros.transforms import transform_lookup
+    from fluoro_shape_ros.transforms import TfPoses
     made = []
     monkeypatch.setattr(tf2_ros, 'TransformListener', lambda buffer, node: made.append(buffer))
-    lookup = transform_lookup(None)
+    lookup = TfPoses(None)
     turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.2]])
     for stamp, turn, x in zip((10, 11), turns, (0.0, 0.4)):
         q = turn.as_quat()
@@ -150,6 +150,9 @@ def test_a_real_buffer_interpolates_between_poses(monkeypatch):
         lookup(REFERENCE, 'plane_a_optical', 20 * SECOND)
     with pytest.raises(NoTransform, match='nowhere'):
         lookup(REFERENCE, 'nowhere', 10 * SECOND)
+    lookup.forget()
+    with pytest.raises(NoTransform):
+        lookup(REFERENCE, 'plane_a_optical', 10 * SECOND)
 
 
 def test_without_tf2_the_node_says_so_in_one_line():
