@@ -73,7 +73,8 @@ def test_poses_come_from_tf_when_they_should():
     def lookup(reference, camera_frame, stamp_ns):
         asked.append((reference, camera_frame, stamp_ns))
         return ((1.0, 0, 0), (0, 0, -1.0), (0, 1.0, 0)), (0.0, 0.0, 0.8)
-    frame = adapt(job((image(), image(stamp=8)), geometry='tf', reference_frame='cell'), view_of, lookup, Tally())
+    infos = info(), info(frame_id='plane_b_optical')
+    frame = adapt(job((image(), image(stamp=8)), infos, geometry='tf', reference_frame='cell'), view_of, lookup, Tally())
     assert asked == [('cell', 'plane_a_optical', 5), ('cell', 'plane_b_optical', 8)]
     assert np.allclose(frame.views[0].P, [[500, 20, 0, 16], [0, 20, -500, 16], [0, 1, 0, 0.8]])
 
