@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .centerline import Candidate, find_candidates, find_ridges, ridge_scale
+from .centerline import Candidate, find_candidates, find_ridges, ridge_scale, shrinking
 from .data import Outcome
 from .fit import Fit, continues, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
@@ -81,7 +81,7 @@ def track(images, fields, views, radius: float, points: np.ndarray) -> Detection
 
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:
     """The lines of one image that look most like a device of this width, best first; `score` is how much, at most 1."""
-    lines = find_candidates(find_ridges(image, field, ridge_scale(half_width_px)), min_length_px, count=LINES)
+    lines = find_candidates(find_ridges(image, field, ridge_scale(half_width_px), shrinking(half_width_px)), min_length_px, count=LINES)
     scored = []
     for line in lines:
         strips = cut_along(image, field, line.points_px, half_width_range(half_width_px))
