@@ -82,11 +82,12 @@ def track(images, fields, views, radius: float, points: np.ndarray) -> Detection
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:
     """The lines of one image that look most like a device of this width, best first; `score` is how much, at most 1."""
     lines = find_candidates(find_ridges(image, field, ridge_scale(half_width_px), shrinking(half_width_px)), min_length_px, count=LINES)
-    scored = []
-    for line in lines:
-        strips = cut_along(image, field, line.points_px, half_width_range(half_width_px))
-        alike = likeness(mean_profile(strips, np.ones(len(strips.profiles), bool)), half_width_px)
-        scored.append(replace(line, score=float(np.exp((np.clip(alike, 0, 1) - 1) / UNLIKE))))
+    if not lines:
+        return []
+    strips, of = cut_along(image, field, [line.points_px for line in lines], half_width_range(half_width_px))
+    profiles = np.stack([mean_profile(strips.profiles, strips.inside & (of == k)) for k in range(len(lines))])
+    score = np.exp((np.clip(likeness(profiles, half_width_px), 0, 1) - 1) / UNLIKE)
+    scored = [replace(line, score=float(x)) for line, x in zip(lines, score)]
     scored.sort(key=lambda c: -c.score * np.sqrt(len(c.z)))
     return [c for c in scored[:CANDIDATES] if c.score > HOPELESS * scored[0].score]
 

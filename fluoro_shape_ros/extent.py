@@ -49,11 +49,12 @@ def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.n
 
 
 def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: float, outward: int, beyond: np.ndarray,
-           ramp: float = 0.0) -> tuple[float, float]:
+           ramp: float = 0.0, density: float = 1.0) -> tuple[float, float]:
     """Arc length (m) where the device ends, and its standard deviation (m).
 
     s: (N,) m. presence: (N, 2), sigma: (2,) its noise, speed: (N, 2) px per m. outward: +1 for the end at large s, -1 at small.
     beyond: (2,) m, see `bulge`. ramp: m over which the end fades in the more foreshortened plane; its model is worth RAMP of that.
+    density: strips a px, so many of which are one observation.
     Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
     clipped at 3.5 sigma.
     """
@@ -65,13 +66,13 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
 
     def edges(v: int, end: np.ndarray, blurs) -> tuple[np.ndarray, np.ndarray, float]:
         """(E,) cost and information of edges at `end` in plane v, with the blur that fits best."""
-        y, weight = presence[rows[v], v], 1 / max(sigma[v], 0.02) ** 2
+        y, weight = presence[rows[v], v], 1 / (density * max(sigma[v], 0.02) ** 2)
         z = (outward * (end[:, None] - s[rows[v]]) + beyond[v]) * speed[rows[v], v]     # (E, n) px inside the device
         tried = []
         for blur in blurs:
             m = ndtr(z / blur)
             a = np.clip((m @ y) / np.maximum((m * m).sum(axis=1), 1e-9), 0.5, 1.8)
-            cost = np.minimum((y - a[:, None] * m) ** 2 * weight, 12).sum(axis=1)
+            cost = np.minimum((y - a[:, None] * m) ** 2 * weight * density, 12).sum(axis=1) / density
             slope = a[:, None] * np.exp(-0.5 * (z / blur) ** 2) / (blur * np.sqrt(2 * np.pi)) * speed[rows[v], v]
             tried.append((cost, (slope**2).sum(axis=1) * weight, blur))
         return min(tried, key=lambda t: t[0].min())
