@@ -7,15 +7,16 @@ are perpendicular and sub-pixel, no correspondence is needed any more, and the n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from .curve import arc_length
-from .extent import bulge, locate, supported
+from .extent import End, bulge, locate, supported
 from .geometry import pixels_per_metre
-from .solver import Solution, solve
+from .solver import EndRow, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import Measurement, Strips, cut, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
+from .strips import Measurement, Strips, apparent_width, cut, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
 
 COARSE, FINE = 2, 3
 COARSE_STEP = 3         # px between the strips of a coarse round
@@ -24,7 +25,9 @@ WIDE_PX = 8.0           # extra reach of the strips while the start is still rou
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
 NEAR_END_PX = 8
 GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
-END_WINDOW_PX, END_STEP_PX = 24.0, 0.5   # strips around an end
+END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
+UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
+SURPRISE = 12.0         # squared difference of the planes' ends that the curve's covariance explains
 ASIDE = 0.8             # darkness beside the extension of a fit, as a share of the device's, that makes a tracked fit suspect
 GOES_ON = 0.25          # darkness beyond an end, as a share of the usual, that makes one look farther
 
@@ -45,6 +48,8 @@ class Fit:
     contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, after blur
     across: np.ndarray          # (2,) the same as if seen straight on, by Beer-Lambert
     likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder of robot_radius
+    width: float                # how many times as wide as that it looks
+    likeness_so_wide: np.ndarray    # (2,) correlation with a cylinder of that width
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
 
 
@@ -91,8 +96,31 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
             rounds, grown = [True] + [False] * (FINE - 1), grown + 1
         else:
             break
-    found = _finish(solution, s, strips, seen, reference, beyond, half_width, radius)
-    return _see_ends(images, fields, views, found, own, half_width, radius)
+    look = partial(_look, images, fields, views, own)
+    found, ends = _finish(solution, s, strips, seen, reference, beyond, half_width, radius)
+    agreed = _agree(found, ends, views)
+    if agreed:
+        strips, seen = look(found, s, within)
+        found, ends = _finish(solve(spline, s, strips, seen, views, within, agreed), s, strips, seen, reference, beyond, half_width, radius)
+    return _see_ends(look, found, ends, half_width, radius)
+
+
+def _look(images, fields, views, own: np.ndarray, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
+    """Strips across a fit at (N,) arc lengths, and what they say of a device whose profile is `own` (2, W)."""
+    strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), (own.shape[1] - 1) // 2)
+    return strips, measure(strips, own, within)
+
+
+def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
+    """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough to say where it ends."""
+    rows = []
+    for end in ends:
+        if end is not None and np.isfinite(end.seen_at).all():
+            row = EndRow.of(f.spline, end.at, end.seen_at, end.seen_sigma, views)
+            known = row.row @ f.covariance @ row.row
+            if known > UNKNOWN * row.variance and row.target**2 < SURPRISE * (known + row.variance):
+                rows.append(row)
+    return rows
 
 
 def _shadows(half_width, offsets_px: np.ndarray) -> np.ndarray:
@@ -108,7 +136,8 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.median(past, axis=0)
 
 
-def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference, beyond, half_width, radius) -> Fit:
+def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference, beyond, half_width, radius) -> tuple[Fit, list[End | None]]:
+    """The fit, and its ends where they are seen."""
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
     between = (s > reference[0]) & (s < reference[1])
     profile = [mean_profile(p, between & i) for p, i in zip(strips.profiles, strips.inside)]
@@ -116,38 +145,43 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
     scale = np.array(half_width) / radius
     across = 1 - (1 - contrast) ** np.clip(np.median(strips.speed[:, between], axis=1) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
     alike = np.array([likeness(p, h) for p, h in zip(profile, half_width)])
-    ends, open_end = list(reference), np.zeros(2, bool)
+    ends, open_end = [None, None], np.zeros(2, bool)
+    start_stop = list(reference)
     for k, outward in enumerate((-1, 1)):
         i = min(int(np.searchsorted(s, reference[k])), len(s) - 1)
         past = inside[i:i + 14] if outward > 0 else inside[max(i - 14, 0):i + 1]
-        if not past.all():    # it runs out of a field before its end could be seen
+        if past.all():
+            ends[k] = locate(s, presence, seen.presence_sigma, strips.speed.T, reference[k], outward, *_shape_of_end(strips.speed[:, i], scale, across, radius))
+            start_stop[k] = ends[k].at
+        else:       # it runs out of a field before its end could be seen
             open_end[k] = True
             dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
-            ends[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
-    covariance = np.linalg.inv(solution.information)
-    return Fit(solution.spline, ends[0], ends[1], np.zeros(2), open_end, covariance, s, presence, solution.offset_px.T, contrast, across, alike, np.nan_to_num(beyond))
+            start_stop[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
+    found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, np.linalg.inv(solution.information), s, presence, solution.offset_px.T,
+                contrast, across, alike, *apparent_width(profile, half_width), np.nan_to_num(beyond))
+    return found, ends
 
 
-def _see_ends(images, fields, views, f: Fit, own: np.ndarray, half_width, radius: float) -> Fit:
-    """The fit with its ends located; `own` (2, W) is the device's profile in each plane.
+def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
+    """(2,) m of `bulge` and m over which the end fades in the more foreshortened plane."""
+    sine = np.clip(speed / px_per_m, 0.1, 1.0)
+    return bulge(radius, speed, px_per_m, across), radius / float(np.tan(np.arcsin(sine)).min())
 
-    Twice, the second time by strips laid out from the end that the first has found: where strips happen to lie must not count.
-    """
+
+def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -> Fit:
+    """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
     scale, step = np.array(half_width) / radius, f.s[1] - f.s[0]
-    ends, sigma = np.array([f.start, f.stop]), f.end_sigma.copy()
+    at, sigma = [f.start, f.stop], np.zeros(2)
     window = np.arange(-END_WINDOW_PX, END_WINDOW_PX + END_STEP_PX, END_STEP_PX) * step
-    reach = (own.shape[1] - 1) // 2
-    for k in np.nonzero(~f.open_end)[0]:
-        outward = (-1, 1)[k]
-        for _ in range(2):
-            s = ends[k] + window
-            strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), reach)
-            seen = measure(strips, own, outward * (s - ends[k]) < 0)
-            speed = strips.speed.T
-            sine = np.clip(speed[len(s) // 2] / scale, 0.1, 1.0)
-            ends[k], sigma[k] = locate(s, seen.presence.T, seen.presence_sigma, speed, ends[k], outward, bulge(radius, speed[len(s) // 2], scale, f.across),
-                                       radius / float(np.tan(np.arcsin(sine)).min()), 1 / END_STEP_PX)
-    return replace(f, start=float(ends[0]), stop=float(ends[1]), end_sigma=sigma)
+    for k, end in enumerate(ends):
+        if end is not None:
+            outward, s = (-1, 1)[k], end.at + window
+            strips, seen = look(f, s, outward * (s - end.at) < 0)
+            speed = strips.speed[:, len(s) // 2]
+            again = locate(s, seen.presence.T, seen.presence_sigma, strips.speed.T, end.at, outward, *_shape_of_end(speed, scale, f.across, radius),
+                           density=1 / END_STEP_PX, reach_px=END_REACH_PX)
+            at[k], sigma[k] = again.at, replace(end, sigma=again.sigma).honest_sigma(float(speed.mean()))
+    return replace(f, start=at[0], stop=at[1], end_sigma=sigma)
 
 
 def _contrast(profile: np.ndarray) -> float:

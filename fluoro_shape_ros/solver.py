@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from .geometry import projection_jacobian
 from .spline import Spline3, bending
 from .strips import Measurement, Strips
 
@@ -58,8 +60,35 @@ class Pieces:
         return np.bincount(self.unknowns.ravel(), parts.ravel())
 
 
-def solve(spline: Spline3, s: np.ndarray, strips: Strips, seen: Measurement, views, within: np.ndarray) -> Solution:
-    """One Gauss-Newton step.
+@dataclass(frozen=True)
+class EndRow:
+    """What both planes' view of one end says of the curve there: row . dC = target."""
+
+    row: np.ndarray     # (3 n,)
+    target: float       # m
+    variance: float     # m^2
+
+    @classmethod
+    def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray, views) -> EndRow:
+        """From where along the curve, m, each plane (2,) sees the device end.
+
+        A curve that runs in an epipolar plane is seen across itself by neither plane; only its ends tell its depth. Moved by dX at its end, plane v
+        sees that end at s_v - t_v J_v dX / |J_v X'|, t_v along the projected curve; both planes must see one end:
+        (t_a J_a / |J_a X'| - t_b J_b / |J_b X'|) dX = s_a - s_b.
+        """
+        s = np.array([at])
+        X, T = spline(s)[0], spline(s, 1)[0]
+        steps = []
+        for v in views:
+            J = projection_jacobian(v.P, X)
+            step = J @ T
+            steps.append(step @ J / max(step @ step, 1e-9))
+        row = (spline.basis(s)[0][:, None] * (steps[0] - steps[1])).ravel()
+        return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
+
+
+def solve(spline: Spline3, s: np.ndarray, strips: Strips, seen: Measurement, views, within: np.ndarray, ends: Sequence[EndRow] = ()) -> Solution:
+    """One Gauss-Newton step. `ends`: what else must hold.
 
     Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's biweight); prior: third
     differences of the control points. The Jacobian of a projection has rank 2, n picks what is seen across the curve.
@@ -77,6 +106,8 @@ def solve(spline: Spline3, s: np.ndarray, strips: Strips, seen: Measurement, vie
     d = tabled(seen.offset_px)
     w0 = tabled(within / (REDUNDANCY * seen.variance + MODEL_PX**2)) * np.tile(table.there, 2)
     prior, pull = _prior(spline, s, k, b, table)
+    for end in ends:
+        prior, pull = prior + np.outer(end.row, end.row) / end.variance, pull + end.row * (end.target / end.variance)
     w, used = w0, w0 > 0
     for _ in range(REWEIGHTED):
         weighted = rows * w[..., None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,6 +15,8 @@ from .geometry import distort
 
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
+BLUR_PX = 1.0           # of an image, beside the device's own shape
+WIDTHS = np.geomspace(0.5, 1.8, 17)
 
 
 @dataclass(frozen=True)
@@ -91,18 +94,32 @@ def likeness(profiles: np.ndarray, half_width_px: float) -> np.ndarray:
     return a @ b / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b) + 1e-12)
 
 
+def apparent_width(profiles: np.ndarray, half_width_px) -> tuple[float, np.ndarray]:
+    """How many times as wide as expected the (V, W) profiles of V planes look, the same in all, and the (V,) likeness of each with such a cylinder."""
+    alike = np.stack([[likeness(p, h * k) for k in WIDTHS] for p, h in zip(profiles, half_width_px)])
+    best = int(alike.min(axis=0).argmax())
+    return float(WIDTHS[best]), alike[:, best]
+
+
 def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
     """(W,) median of the good ones among (N, W) profiles; all equal where there are none."""
     return np.median(profiles[good], axis=0) if good.any() else np.ones(profiles.shape[-1])
 
 
-def shadow(half_width_px: float, offsets_px: np.ndarray, blur_px: float = 1.0) -> np.ndarray:
-    """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred."""
-    fine = np.arange(offsets_px[0] - 4, offsets_px[-1] + 4 + 1e-9, 0.125)
-    chord = np.sqrt(np.maximum(half_width_px**2 - fine**2, 0))
-    kernel = np.exp(-0.5 * (np.arange(-32, 33) * 0.125 / blur_px) ** 2)
+def shadow(half_width_px: float, offsets_px: np.ndarray) -> np.ndarray:
+    """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred. h counts in hundredths of a px."""
+    return np.interp(offsets_px, *_shadow(round(100 * half_width_px)), 0.0, 0.0)
+
+
+@lru_cache(1024)
+def _shadow(half_width_cpx: int) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets in px, 0.125 apart, and the blurred chord there."""
+    reach = half_width_cpx / 100 + 5 * BLUR_PX
+    x = np.arange(-np.ceil(reach), np.ceil(reach) + 1e-9, 0.125)
+    chord = np.sqrt(np.maximum((half_width_cpx / 100) ** 2 - x**2, 0))
+    kernel = np.exp(-0.5 * (np.arange(-32, 33) * 0.125 / BLUR_PX) ** 2)
     blurred = np.convolve(chord, kernel / kernel.sum(), mode='same')
-    return np.interp(offsets_px, fine, blurred / blurred.max())
+    return x, blurred / blurred.max()
 
 
 def own_shadow(profiles: np.ndarray, offsets_px: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:
