@@ -16,7 +16,7 @@ from .extent import End, bulge, locate, supported
 from .geometry import pixels_per_metre
 from .solver import EndRow, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import Measurement, Strips, apparent_width, cut, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
+from .strips import Measurement, Strips, apparent_width, cut, half_width_range, mean_profile, measure, own_shadow, pieces, search, shadow
 
 COARSE, FINE = 2, 3
 COARSE_STEP = 3         # px between the strips of a coarse round
@@ -27,9 +27,9 @@ NEAR_END_PX = 8
 GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
-SURPRISE = 12.0         # squared difference of the planes' ends that the curve's covariance explains
+SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
 ASIDE = 0.8             # darkness beside the extension of a fit, as a share of the device's, that makes a tracked fit suspect
-GOES_ON = 0.25          # darkness beyond an end, as a share of the usual, that makes one look farther
+GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,8 @@ class Fit:
     offset_px: np.ndarray       # (N, 2) of the device from the fitted curve; NaN where not measured
     contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, after blur
     across: np.ndarray          # (2,) the same as if seen straight on, by Beer-Lambert
-    likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder of robot_radius
-    width: float                # how many times as wide as that it looks
-    likeness_so_wide: np.ndarray    # (2,) correlation with a cylinder of that width
+    width: float                # how many times as wide as a cylinder of robot_radius it looks
+    likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder so wide
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
 
 
@@ -87,7 +86,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         if (rounds and not settled) or grown == GROWTH:
             continue
         beyond = np.stack([_beyond(seen.presence.T, stretch[0], -1), _beyond(seen.presence.T, stretch[1], 1)])
-        goes_on = [bool((b > GOES_ON).all()) for b in beyond]
+        goes_on = [bool((b > GOES_ON).all() or (b > GOES_ON_ALONE).any()) for b in beyond]
         gained = (reference[1] - reference[0]) / step - length_px
         if any(goes_on) and (not grown or gained > NEAR_END_PX):        # look farther, as long as that finds something
             length_px = (reference[1] - reference[0]) / step
@@ -144,7 +143,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
     contrast = np.array([_contrast(p) for p in profile])
     scale = np.array(half_width) / radius
     across = 1 - (1 - contrast) ** np.clip(np.median(strips.speed[:, between], axis=1) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
-    alike = np.array([likeness(p, h) for p, h in zip(profile, half_width)])
+    width, alike = apparent_width([pieces(p, between & i) for p, i in zip(strips.profiles, strips.inside)], half_width)
     ends, open_end = [None, None], np.zeros(2, bool)
     start_stop = list(reference)
     for k, outward in enumerate((-1, 1)):
@@ -158,7 +157,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
             dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
             start_stop[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
     found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, np.linalg.inv(solution.information), s, presence, solution.offset_px.T,
-                contrast, across, alike, *apparent_width(profile, half_width), np.nan_to_num(beyond))
+                contrast, across, width, alike, np.nan_to_num(beyond))
     return found, ends
 
 

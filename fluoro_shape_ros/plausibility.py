@@ -7,7 +7,7 @@ import numpy as np
 from .config import Config
 from .curve import curvature
 from .data import Outcome
-from .detect import LENIENT, evidence
+from .detect import evidence
 from .fit import Fit, contrast_ratio, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
@@ -15,7 +15,7 @@ WIDTH = (0.6, 1.25)     # how many times as wide as robot_radius it may look: th
 MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
-MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
+MAX_END_SIGMA, MAX_END_PX = 1.5e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see detect.evidence, for a length of 1 m
 
@@ -25,8 +25,8 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
     length_px = (f.stop - f.start) / (f.s[1] - f.s[0])
     if length_px < config.detection.min_length_px:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
-    if f.contrast.min() < MIN_CONTRAST or f.likeness_so_wide.min() < MIN_LIKENESS:
-        return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness_so_wide)
+    if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
+        return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
     if not WIDTH[0] < f.width < WIDTH[1]:
         return Outcome.POORLY_EXPLAINED, f'it looks {f.width:.1f} times as wide as a device of robot_radius'
     ratio = contrast_ratio(f)
@@ -40,7 +40,7 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
-    if evidence(f, LENIENT) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
+    if evidence(f) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
         return Outcome.POORLY_EXPLAINED, 'too little speaks for it being one device in both planes (likeness, darkness, ends)'
     return None
 

@@ -16,6 +16,7 @@ from .geometry import distort
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
+PIECE = 32              # strips
 WIDTHS = np.geomspace(0.5, 1.8, 17)
 
 
@@ -94,11 +95,22 @@ def likeness(profiles: np.ndarray, half_width_px: float) -> np.ndarray:
     return a @ b / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b) + 1e-12)
 
 
-def apparent_width(profiles: np.ndarray, half_width_px) -> tuple[float, np.ndarray]:
-    """How many times as wide as expected the (V, W) profiles of V planes look, the same in all, and the (V,) likeness of each with such a cylinder."""
-    alike = np.stack([[likeness(p, h * k) for k in WIDTHS] for p, h in zip(profiles, half_width_px)])
-    best = int(alike.min(axis=0).argmax())
-    return float(WIDTHS[best]), alike[:, best]
+def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np.ndarray]:
+    """How many times as wide as expected a device looks, the same in all V planes, and the (V,) likeness of each with a cylinder so wide.
+
+    profiles: (B, W) of its pieces in each plane. The median piece counts: some may run along another edge.
+    """
+    alike = np.array([[np.median(likeness(p, h * k)) if len(p) else 0.0 for p, h in zip(profiles, half_width_px)] for k in WIDTHS])
+    best = int(alike.min(axis=1).argmax())
+    return float(WIDTHS[best]), alike[best]
+
+
+def pieces(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """(B, W) medians of successive PIECE good ones among (N, W) profiles; one of all where there are fewer."""
+    profiles = profiles[good]
+    if len(profiles) < PIECE:
+        return np.median(profiles, axis=0, keepdims=True) if len(profiles) else profiles
+    return np.median(profiles[:len(profiles) // PIECE * PIECE].reshape(-1, PIECE, profiles.shape[1]), axis=1)
 
 
 def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
