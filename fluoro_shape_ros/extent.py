@@ -14,7 +14,8 @@ BRIDGED_PX = 70         # a stretch that only one plane shows, or none up to GAP
 GAP_PX = 30
 SMOOTH_PX = 9
 REACH_PX = 12.0         # the edge is looked for this far around the first guess
-BLURS_PX = (0.8, 1.1, 1.5, 2.2)
+COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
+BLURS_PX = (0.8, 1.2, 1.9)
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
 RAMP = 0.1
 DISAGREE_PX = 0.9       # what the planes' ends may differ by, beside noise
@@ -103,11 +104,11 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
         return min(tried, key=lambda t: t[0].min())
 
     model = (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2 + (RAMP * ramp) ** 2
-    wide = guess + np.arange(-reach_px, reach_px + 0.01, 0.6) / px_per_m
+    wide = guess + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m
     coarse = {v: edges(v, wide, BLURS_PX) for v in rows}
     for v, (cost, information, _) in coarse.items():
         seen_at[v], seen_sigma[v] = _lowest(wide, cost), np.sqrt(1 / (information[np.argmin(cost)] + 1e-12) + model)
-    fine = wide[np.argmin(sum(c[0] for c in coarse.values()))] + np.arange(-1.0, 1.01, 0.1) / px_per_m
+    fine = wide[np.argmin(sum(c[0] for c in coarse.values()))] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m
     seen = [edges(v, fine, [coarse[v][2]]) for v in rows]
     cost, information = sum(c for c, _, _ in seen), sum(i for _, i, _ in seen)
     return End(_lowest(fine, cost), float(np.sqrt(1 / (information[np.argmin(cost)] + 1e-12) + model)), seen_at, seen_sigma)

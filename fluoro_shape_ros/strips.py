@@ -17,7 +17,7 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 32              # strips
-WIDTHS = np.geomspace(0.5, 1.8, 17)
+WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
 
 
 @dataclass(frozen=True)
@@ -88,11 +88,23 @@ def _sample(image, field, view: View | None, centers, normals, offsets) -> tuple
 
 
 def likeness(profiles: np.ndarray, half_width_px: float) -> np.ndarray:
-    """(...) correlation of (..., W) profiles, one sample a px about their middles, with a cylinder's shadow; a smooth background (parabola) taken off both."""
-    x = np.arange(profiles.shape[-1]) - profiles.shape[-1] // 2
+    """(..., K) correlation of (..., W) profiles, one sample a px about their middles, with the shadows of cylinders WIDTHS times as wide.
+
+    A smooth background (parabola) is taken off both.
+    """
+    basis, shadows = _cylinders(round(100 * half_width_px), profiles.shape[-1])
+    a = profiles @ basis @ basis.T - profiles
+    return a @ shadows.T / (np.linalg.norm(a, axis=-1, keepdims=True) + 1e-12)
+
+
+@lru_cache(256)
+def _cylinders(half_width_cpx: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(W, 3) orthonormal parabolas, and (K, W) shadows without them, of unit norm."""
+    x = np.arange(count) - count // 2
     basis, _ = np.linalg.qr(np.vander(x / x[-1], 3))
-    a, b = (p - p @ basis @ basis.T for p in (-profiles, shadow(half_width_px, x)))
-    return a @ b / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b) + 1e-12)
+    shadows = np.stack([shadow(half_width_cpx / 100 * k, x) for k in WIDTHS])
+    shadows -= shadows @ basis @ basis.T
+    return basis, shadows / np.linalg.norm(shadows, axis=1, keepdims=True)
 
 
 def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np.ndarray]:
@@ -100,9 +112,9 @@ def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np
 
     profiles: (B, W) of its pieces in each plane. The median piece counts: some may run along another edge.
     """
-    alike = np.array([[np.median(likeness(p, h * k)) if len(p) else 0.0 for p, h in zip(profiles, half_width_px)] for k in WIDTHS])
-    best = int(alike.min(axis=1).argmax())
-    return float(WIDTHS[best]), alike[best]
+    alike = np.stack([np.median(likeness(p, h), axis=0) if len(p) else np.zeros(len(WIDTHS)) for p, h in zip(profiles, half_width_px)])
+    best = int(alike.min(axis=0).argmax())
+    return float(WIDTHS[best]), alike[:, best]
 
 
 def pieces(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
@@ -164,7 +176,7 @@ def measure(strips: Strips, shadows: np.ndarray, reference: np.ndarray | None = 
     fit = np.linalg.pinv(M)                                                     # (V, 5, W)
     coefficients = strips.profiles @ fit.transpose(0, 2, 1)
     rest = strips.profiles - coefficients @ M.transpose(0, 2, 1)
-    noise = 1.4826 * np.median(np.abs(rest).reshape(len(rest), -1), axis=1)[:, None] * np.sqrt(width / (width - 5)) + 1e-9
+    noise = 1.4826 * np.median(np.abs(rest[:, ::2]).reshape(len(rest), -1), axis=1)[:, None] * np.sqrt(width / (width - 5)) + 1e-9
     inside = strips.inside
     darkness = np.where(inside, -coefficients[..., 3], np.nan)
     usual = np.stack([_running_median(d, i if reference is None else i & reference) for d, i in zip(darkness, inside)])

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
-from fluoro_shape_ros.strips import Measurement, Strips, cut, cut_along, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
+from fluoro_shape_ros.strips import WIDTHS, Measurement, Strips, cut, cut_along, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -58,7 +58,7 @@ def searched(strips):
 
 
 def alike(strips):
-    return likeness(mean_profile(strips.profiles[0], ALL), HALF_WIDTH)
+    return likeness(mean_profile(strips.profiles[0], ALL), HALF_WIDTH)[np.abs(WIDTHS - 1).argmin()]
 
 
 @pytest.mark.parametrize('direction', [(1, 0, 0), (0, 0, 1), (-1, 0, 0.4), (1, 0.3, 1)])
