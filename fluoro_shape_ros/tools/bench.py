@@ -11,11 +11,11 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..config import fields
+from . import speed
 from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, on_real
-from .speed import report
 from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
 METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
@@ -29,19 +29,40 @@ def main(argv=None) -> int:
     robustness = _add_tables(commands, 'robustness', 'one difficulty at a time, and scenes where nothing may be published', ROBUSTNESS)
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
-    timing = commands.add_parser('speed', help='how long a pair takes, checked against truth, beside a yardstick timed in the same run')
-    timing.add_argument('--sizes', type=_count, nargs='+', default=[512, 1024, 2048], metavar='PX', help='image sizes (default: 512 1024 2048)')
-    timing.add_argument('--scenes', type=_count, default=5, metavar='N', help='anatomy scenes of each size (default: 5)')
-    timing.add_argument('--rounds', type=_count, default=10, metavar='N', help='how often each is timed (default: 10)')
-    timing.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
-    timing.set_defaults(body=_speed)
+    _add_speed(commands)
     return run(lambda args: args.body(args, parser), parser, argv)
+
+
+def _add_speed(commands) -> None:
+    text = 'how long a pair takes, checked against truth, in ms and in multiples of a yardstick that is timed in between'
+    command = commands.add_parser('speed', help=text, description=f'{text[0].upper()}{text[1:]}.')
+    command.add_argument('--sizes', type=_count, nargs='+', default=[512, 768, 1024, 1536, 2048], metavar='PX',
+                         help='image sizes; all show the same field at the same dose (default: 512 768 1024 1536 2048)')
+    command.add_argument('--scenes', type=_count, default=20, metavar='N', help='anatomy scenes of each size (default: 20)')
+    command.add_argument('--rounds', type=_count, default=5, metavar='N', help='how often each is timed, all others in between (default: 5)')
+    command.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    command.add_argument('--alone', action='store_true', help='without method paper and skimage\'s frangi, which take seconds a pair')
+    command.add_argument('--json', type=Path, metavar='FILE', help='write every time there, in s')
+    command.set_defaults(body=_speed)
 
 
 def _speed(args, parser: argparse.ArgumentParser) -> int:
     """Print the table of times."""
-    print(report(args.sizes, args.scenes, args.rounds, args.first_seed))
+    _check_files(args.json)
+    beside = 1024 if 1024 in args.sizes else args.sizes[0]
+    found = [laps for size in sorted(set(args.sizes))
+             for laps in speed.measure(size, args.scenes, args.rounds, args.first_seed, speed.COMPARED if size == beside and not args.alone else 0)]
+    print(speed.table(found))
+    if args.json:
+        args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'laps': speed.plain(found)}, indent=1) + '\n')
     return 0
+
+
+def _check_files(*files: Path | None) -> None:
+    """Raises ToolError for one that could not be written when the work is done."""
+    for file in filter(None, files):
+        if not file.absolute().parent.is_dir():
+            raise ToolError(f'{file}: there is no such folder')
 
 
 def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
@@ -73,9 +94,7 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
         parser.error(f'no such family: {", ".join(unknown)}; there are {", ".join(known)}{hint}')
     if args.plot and args.plot.suffix.lower() != '.png':
         parser.error(f'--plot {args.plot}: only .png can be drawn')
-    for file in filter(None, (args.json, args.plot)):
-        if not file.absolute().parent.is_dir():
-            raise ToolError(f'{file}: there is no such folder')
+    _check_files(args.json, args.plot)
     if args.first_seed < 0:
         parser.error(f'--first-seed {args.first_seed}: seeds count from 0')
     if 'p' in names:
