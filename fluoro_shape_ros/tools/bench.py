@@ -6,18 +6,20 @@ import argparse
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 
 from tqdm import tqdm
 
 from ..config import fields
-from . import speed
+from . import latency, memory, speed
 from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, on_real
 from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
+DEVICE = 9              # default seed of what moves in front of the node
 METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
 
 
@@ -30,6 +32,8 @@ def main(argv=None) -> int:
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
     _add_speed(commands)
+    _add_latency(commands)
+    _add_memory(commands)
     return run(lambda args: args.body(args, parser), parser, argv)
 
 
@@ -55,6 +59,61 @@ def _speed(args, parser: argparse.ArgumentParser) -> int:
     print(speed.table(found))
     if args.json:
         args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'laps': speed.plain(found)}, indent=1) + '\n')
+    return 0
+
+
+def _add_latency(commands) -> None:
+    text = 'how late an answer is on real topics, beside CPU, memory, start-up and what is lost, at several rates'
+    command = commands.add_parser('latency', help=text, description=f'{text[0].upper()}{text[1:]}: the node runs as a process of its own.')
+    command.add_argument('--rates', type=_positive, nargs='+', default=[7.5, 15, 30, 60, 200], metavar='HZ', help='pairs a second (default: 7.5 15 30 60 200)')
+    command.add_argument('--seconds', type=_positive, default=60.0, metavar='S', help='at each rate (default: 60)')
+    command.add_argument('--as-shipped', action='store_true', help='Fast DDS as it comes, without this package\'s profile for megapixel images')
+    command.add_argument('--full', action='store_true', help='parameter tracking off: every pair is searched from scratch')
+    _add_node_options(command, size=1024)
+    command.set_defaults(body=_latency)
+
+
+def _add_memory(commands) -> None:
+    text = 'whether the node\'s memory grows'
+    command = commands.add_parser('memory', help=text, description=f'{text[0].upper()}{text[1:]}: it runs as a process of its own, on real topics.')
+    command.add_argument('--pairs', type=_count, default=10_000, metavar='N', help='(default: 10000)')
+    command.add_argument('--everything', action='store_true', help='subscribe to overlays, markers and points too')
+    _add_node_options(command, size=512)
+    command.set_defaults(body=_memory)
+
+
+def _add_node_options(command: argparse.ArgumentParser, size: int) -> None:
+    command.add_argument('--size', type=_count, default=size, metavar='PX', help=f'of the images (default: {size})')
+    command.add_argument('--seed', type=int, default=DEVICE, help='another seed is another device and anatomy')
+    command.add_argument('--domain', type=int, default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
+    command.add_argument('--json', type=Path, metavar='FILE', help='write what was measured there, in s and bytes')
+
+
+def _ready_for_ros(args) -> None:
+    """Raises ToolError without ROS; after this it may be used."""
+    _check_files(args.json)
+    need('rclpy', 'ros')
+    os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
+    latency.choose_profile(getattr(args, 'as_shipped', False))
+
+
+def _latency(args, parser: argparse.ArgumentParser) -> int:
+    """Print a line a rate."""
+    _ready_for_ros(args)
+    rows = [latency.measure(rate, args.seconds, args.size, args.seed, not args.full) for rate in args.rates]
+    print(latency.table(rows, args.as_shipped))
+    if args.json:
+        args.json.write_text(json.dumps({'command': args.command, 'as_shipped': args.as_shipped, 'rows': [latency.plain(r) for r in rows]}, indent=1) + '\n')
+    return 0
+
+
+def _memory(args, parser: argparse.ArgumentParser) -> int:
+    """Print how much it was and how it grew."""
+    _ready_for_ros(args)
+    measured = memory.measure(args.pairs, args.size, args.seed, args.everything)
+    print(memory.report(measured, args.size))
+    if args.json:
+        args.json.write_text(json.dumps({'command': args.command, **dataclasses.asdict(measured), 'growth': measured.growth}, indent=1) + '\n')
     return 0
 
 
@@ -128,6 +187,12 @@ def _plain(trial: Trial) -> dict:
 def _plain_answer(a: Answer) -> dict:
     return {'outcome': a.outcome.value, 'detail': a.detail, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None,
             'surprise': None if math.isnan(a.surprise) else min(a.surprise, 1e12), 'within': a.within, 'silent_failure': a.silent_failure}
+
+
+def _positive(text: str) -> float:
+    if not 0 < (number := float(text)) < 1e6:
+        raise argparse.ArgumentTypeError(f'{text} is not above zero')
+    return number
 
 
 def _count(text: str) -> int:
