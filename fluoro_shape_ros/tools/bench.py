@@ -17,6 +17,7 @@ from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, on_real
+from .latency import moving_scenes
 from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
 DEVICE = 9              # default seed of what moves in front of the node
@@ -44,7 +45,7 @@ def _add_speed(commands) -> None:
                          help='image sizes; all show the same field at the same dose (default: 512 768 1024 1536 2048)')
     command.add_argument('--scenes', type=_count, default=20, metavar='N', help='anatomy scenes of each size (default: 20)')
     command.add_argument('--rounds', type=_count, default=5, metavar='N', help='how often each is timed, all others in between (default: 5)')
-    command.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    command.add_argument('--first-seed', type=_seed, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
     command.add_argument('--alone', action='store_true', help='without method paper and skimage\'s frangi, which take seconds a pair')
     command.add_argument('--json', type=Path, metavar='FILE', help='write every time there, in s')
     command.set_defaults(body=_speed)
@@ -84,8 +85,9 @@ def _add_memory(commands) -> None:
 
 def _add_node_options(command: argparse.ArgumentParser, size: int) -> None:
     command.add_argument('--size', type=_count, default=size, metavar='PX', help=f'of the images (default: {size})')
-    command.add_argument('--seed', type=int, default=DEVICE, help='another seed is another device and anatomy')
-    command.add_argument('--domain', type=int, default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
+    command.add_argument('--rendered', type=_count, default=32, metavar='N', help='pairs that are rendered beforehand and played forth and back (default: 32)')
+    command.add_argument('--seed', type=_seed, default=DEVICE, help='another seed is another device and anatomy')
+    command.add_argument('--domain', type=int, choices=range(233), default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     command.add_argument('--json', type=Path, metavar='FILE', help='write what was measured there, in s and bytes')
 
 
@@ -100,7 +102,7 @@ def _ready_for_ros(args) -> None:
 def _latency(args, parser: argparse.ArgumentParser) -> int:
     """Print a line a rate."""
     _ready_for_ros(args)
-    rows = [latency.measure(rate, args.seconds, args.size, args.seed, not args.full) for rate in args.rates]
+    rows = [latency.measure(rate, args.seconds, moving_scenes(args.size, rate, args.seed, args.rendered), not args.full) for rate in args.rates]
     print(latency.table(rows, args.as_shipped))
     if args.json:
         args.json.write_text(json.dumps({'command': args.command, 'as_shipped': args.as_shipped, 'rows': [latency.plain(r) for r in rows]}, indent=1) + '\n')
@@ -110,7 +112,7 @@ def _latency(args, parser: argparse.ArgumentParser) -> int:
 def _memory(args, parser: argparse.ArgumentParser) -> int:
     """Print how much it was and how it grew."""
     _ready_for_ros(args)
-    measured = memory.measure(args.pairs, args.size, args.seed, args.everything)
+    measured = memory.measure(args.pairs, moving_scenes(args.size, memory.RATE, args.seed, args.rendered), args.everything)
     print(memory.report(measured, args.size))
     if args.json:
         args.json.write_text(json.dumps({'command': args.command, **dataclasses.asdict(measured), 'growth': measured.growth}, indent=1) + '\n')
@@ -192,6 +194,12 @@ def _plain_answer(a: Answer) -> dict:
 def _positive(text: str) -> float:
     if not 0 < (number := float(text)) < 1e6:
         raise argparse.ArgumentTypeError(f'{text} is not above zero')
+    return number
+
+
+def _seed(text: str) -> int:
+    if (number := int(text)) < 0:
+        raise argparse.ArgumentTypeError(f'{text}: seeds count from 0')
     return number
 
 

@@ -23,7 +23,6 @@ from .speed import FIELD
 from .usage import usage
 
 SPEED = 0.02            # m/s, of the fastest point of the device
-RENDERED = 32           # pairs, played forth and back
 MOMENT = 1.0            # s of the device's motion at which they begin: it starts from rest
 STARTUP_S = 60.0        # for the node's first result
 SETTLE_S = 1.0          # of streaming before the measurement begins
@@ -71,7 +70,7 @@ def choose_profile(as_shipped: bool) -> None:
     use_large_image_profile()
 
 
-def moving_scenes(size: int, rate: float, seed: int, count: int = RENDERED) -> list[scenes.Scene]:
+def moving_scenes(size: int, rate: float, seed: int, count: int) -> list[scenes.Scene]:
     """`count` successive pairs, `rate` a second, of a device whose fastest point moves at about SPEED in front of anatomy."""
     views = biplane(arm=CArm(pixel_size_iso=FIELD / size, width=size, height=size))
     run = scenes.xray_run(seed, views=views, entering=True)
@@ -104,10 +103,9 @@ def first_result(probe, rate: float, process: subprocess.Popen, folder: Path, si
     return min(probe.answered.values()) - since
 
 
-def measure(rate: float, seconds: float, size: int, seed: int, tracking: bool = True) -> Row:
-    """Stream `rate` pairs a second to a node of its own for so many seconds. Raises ToolError where it gives no result."""
+def measure(rate: float, seconds: float, pairs: list[scenes.Scene], tracking: bool = True) -> Row:
+    """Stream `rate` of the pairs a second, forth and back, to a node of its own for so many seconds. Raises ToolError where it gives no result."""
     from .probe import Probe    # needs ROS
-    pairs = moving_scenes(size, rate, seed)
     with tempfile.TemporaryDirectory() as name, Probe(pairs) as probe:
         folder, start = Path(name), time.monotonic()
         with timed_node(pairs[0], folder, {'tracking': str(tracking).lower()}) as process:

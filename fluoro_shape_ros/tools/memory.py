@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from ..sim.scenes import Scene
 from .cli import ToolError
-from .latency import first_result, moving_scenes, timed_node
+from .latency import first_result, timed_node
 from .usage import usage
 
 RATE = 30.0             # pairs a second, for which the motion is rendered
@@ -45,13 +46,12 @@ class Memory:
         return float(np.polyfit(self.after[warm:], self.resident[warm:], 1)[0]) if len(self.resident) - warm > 1 else 0.0
 
 
-def measure(pairs: int, size: int, seed: int, everything: bool = False) -> Memory:
-    """Let a node of its own answer so many pairs; `everything`: with a subscriber to all that it computes on demand too.
+def measure(pairs: int, scenes: list[Scene], everything: bool = False) -> Memory:
+    """Let a node of its own answer so many pairs, `scenes` forth and back; `everything`: with a subscriber to all that it computes on demand too.
 
     Raises ToolError where the node gives no result, or ends.
     """
     from .probe import Probe    # needs ROS
-    scenes = moving_scenes(size, RATE, seed)
     with tempfile.TemporaryDirectory() as name, Probe(scenes) as probe, timed_node(scenes[0], Path(name)) as process:
         if everything:
             probe.listen_to_everything()
