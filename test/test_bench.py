@@ -278,7 +278,7 @@ def test_speed_is_printed_full_and_tracked_and_written(tmp_path, capsys):
 
 def test_growth_is_of_the_cost_per_pixel_in_yardsticks():
     """Twice the width is four times the pixels: 8 Y instead of 2 Y is as much a pixel, whatever Y was just then; 16 Y is twice as much."""
-    small, same, more = (speed.Laps(size, speed.SPLINE, seconds=[s], yardsticks=[y]) for size, s, y in ((512, 2.0, 1.0), (1024, 24.0, 3.0), (1024, 16.0, 1.0)))
+    small, same, more = (speed.Laps(size, speed.SPLINE, seconds=[s], yardsticks=[y], cpu=[s]) for size, s, y in ((512, 2.0, 1.0), (1024, 24.0, 3.0), (1024, 16.0, 1.0)))
     found = [small, same, more]
     assert_allclose([speed.growth(laps, found) for laps in found], [1, 1, 2])
     assert_allclose(small.ns_per_pixel, 1e9 / 512**2)

@@ -44,15 +44,17 @@ class Laps:
     scenes: int = 0
     right: int = 0                  # of these: answered, and within the truth's tolerance
     seconds: list[float] = field(default_factory=list)              # a pair
-    yardsticks: list[float] = field(default_factory=list)           # just before each
+    yardsticks: list[float] = field(default_factory=list)           # s, just before each
+    cpu: list[float] = field(default_factory=list)                  # s of all threads; other work on the machine hardly shows in it
     stages: dict[str, list[float]] = field(default_factory=dict)    # s
 
     def add(self, work: Callable[[], Reconstruction | None], blank: np.ndarray) -> None:
         """Time `work` once, after a yardstick."""
         self.yardsticks.append(yardstick(blank))
-        start = time.perf_counter()
+        start, busy = time.perf_counter(), time.process_time()
         result = work()
         self.seconds.append(time.perf_counter() - start)
+        self.cpu.append(time.process_time() - busy)
         for name, lap in ({} if result is None else result.stage_seconds).items():
             self.stages.setdefault(name, []).append(lap)
 
@@ -147,11 +149,11 @@ def _frangi(images: tuple[np.ndarray, np.ndarray]) -> None:
 def table(found: list[Laps]) -> str:
     """A line a size and way of working, then one a stage, for a terminal."""
     lines = [f'{"px":>5s}  {"what":15s} {"right":>7s} {"n":>5s}  {"ms: median":>10s} {"p95":>7s} {"p99":>7s}  {"Y: median":>9s} {"p95":>7s} {"p99":>7s}  '
-             f'{"ns/px":>6s} {"growth":>6s}']
+             f'{"CPU ms":>7s}  {"ns/px":>6s} {"growth":>6s}']
     for laps in found:
         right = f'{laps.right}/{laps.scenes}' if laps.scenes else '-'
         lines.append(f'{laps.size:5d}  {laps.way:15s} {right:>7s} {len(laps.seconds):5d}  {_quantiles(laps.seconds, 1e-3)}  {_quantiles(laps.seconds, laps.unit, 9)}  '
-                     f'{laps.ns_per_pixel:6.1f} {growth(laps, found):6.2f}')
+                     f'{np.median(laps.cpu) * 1e3:7.1f}  {laps.ns_per_pixel:6.1f} {growth(laps, found):6.2f}')
     lines += ['', f'{"px":>5s}  {"stage":25s} {"n":>5s}  {"ms: median":>10s} {"p95":>7s} {"p99":>7s}  {"Y: median":>9s} {"p95":>7s} {"p99":>7s}']
     for laps in found:
         for stage, seconds in laps.stages.items():
@@ -166,7 +168,7 @@ def growth(laps: Laps, found: list[Laps]) -> float:
 
 def plain(found: list[Laps]) -> list[dict]:
     """For JSON: everything, in s."""
-    return [{'size_px': f.size, 'way': f.way, 'scenes': f.scenes, 'right': f.right, 'seconds': f.seconds, 'yardsticks': f.yardsticks, 'stages': f.stages,
+    return [{'size_px': f.size, 'way': f.way, 'scenes': f.scenes, 'right': f.right, 'seconds': f.seconds, 'yardsticks': f.yardsticks, 'cpu_seconds': f.cpu, 'stages': f.stages,
              'median_y': float(np.median(f.seconds)) / f.unit, 'p95_y': float(np.percentile(f.seconds, 95)) / f.unit,
              'ns_per_pixel': f.ns_per_pixel, 'growth': growth(f, found)} for f in found]
 
@@ -181,5 +183,6 @@ def _legend(found: list[Laps]) -> list[str]:
     return [f'Y        cv2.GaussianBlur(float32 1024x1024, sigma 2) on two images, before every repeat: {np.median(y) * 1e3:.2f} ms (p95 {np.percentile(y, 95) * 1e3:.2f})',
             f'right    scenes answered within {WITHIN_MEAN * 1e3:g} mm mean and {WITHIN_TIP * 1e3:g} mm at the tip: only these are timed (paper: all)',
             f'sizes    the same field of {FIELD * 1e3:.0f} mm at the same dose, in finer pixels; ns/px: median over the pixels of both images',
+            'CPU ms   median of all threads together, which other work on the machine hardly touches',
             'growth   cost per pixel, in Y, as a multiple of that at the smallest size',
             f'machine  {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {cv2.getNumThreads()} threads of OpenCV {cv2.__version__}, NumPy {np.__version__}']
