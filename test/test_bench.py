@@ -284,8 +284,11 @@ def test_growth_is_of_the_cost_per_pixel_in_yardsticks():
     assert_allclose(small.ns_per_pixel, 1e9 / 512**2)
 
 
-def test_what_is_wrong_is_not_timed(monkeypatch):
+def test_what_is_wrong_is_not_timed(monkeypatch, capsys):
     monkeypatch.setattr(speed, 'reconstruct', lambda frame, *_: Reconstruction(Outcome.NO_DEVICE_A))
     monkeypatch.setattr(speed, 'sequences', lambda *_: [(case().scene,) * 2])
-    with pytest.raises(ToolError, match='none of 1 scenes'):
-        speed.measure(320, 1, 1, 0)
+    found = speed.measure(320, 1, 1, 0, compared=0)
+    assert [(laps.scenes, laps.right, laps.seconds) for laps in found] == [(1, 0, [])] * 2
+    assert 'nan' in speed.table(found + [speed.Laps(320, speed.PAPER, 1, 0, [1.0], [0.1], [1.0])])
+    assert bench.main(['speed', '--sizes', '320', '--scenes', '1', '--alone']) == 1
+    assert 'none of 1 scenes' in capsys.readouterr().err

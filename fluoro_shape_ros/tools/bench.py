@@ -57,6 +57,8 @@ def _speed(args, parser: argparse.ArgumentParser) -> int:
     beside = 1024 if 1024 in args.sizes else args.sizes[0]
     found = [laps for size in sorted(set(args.sizes))
              for laps in speed.measure(size, args.scenes, args.rounds, args.first_seed, speed.COMPARED if size == beside and not args.alone else 0)]
+    if not any(laps.right for laps in found):
+        raise ToolError(f'none of {args.scenes} scenes a size was answered rightly, so no time means anything')
     print(speed.table(found))
     if args.json:
         args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'laps': speed.plain(found)}, indent=1) + '\n')
