@@ -137,7 +137,7 @@ def table(rows: list[Row], as_shipped: bool) -> str:
     lines += [_line(row) for row in rows]
     profile = 'as shipped' if as_shipped else os.environ.get(PROFILES[0]) or os.environ.get(PROFILES[1]) or 'no profile'
     return '\n'.join([*lines, '', f"""\
-latency   from handing over the second image of a pair to having its Path; compute: the reconstruction's share of it; rest: the difference, pair by pair
+latency   from handing over the second image of a pair to having its Path, not yet as Python objects; compute: the reconstruction's share of it; rest: the difference, pair by pair
 dropped   overtaken by a newer pair, as the node counts it; lost: known to nobody
 services  ms that ~/clear_mask and set_parameters, called four times a second, took to answer meanwhile
 node      cores it kept busy, resident memory at the end and at most, s from its start to the first result
