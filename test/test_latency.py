@@ -81,7 +81,7 @@ def run(*arguments, file):
 def test_latency_on_real_topics(tmp_path):
     """Slowly enough for a busy machine; what is not answered in time is dropped, and everything is accounted for."""
     pytest.importorskip('rclpy')
-    out, found = run('latency', '--rates', '5', '--seconds', '3', '--size', '512', file=tmp_path / 'rows.json')
+    out, found = run('latency', '--rates', '5', '--seconds', '3', file=tmp_path / 'rows.json')
     row, = found['rows']
     assert row['sent'] >= 5 and row['answered'] >= 1 and row['answered'] == len(row['latency']) == len(row['compute'])
     assert row['lost'] == row['sent'] - row['answered'] - row['refused'] - row['dropped']
@@ -93,4 +93,4 @@ def test_latency_on_real_topics(tmp_path):
 def test_memory_on_real_topics(tmp_path):
     pytest.importorskip('rclpy')
     out, found = run('memory', '--pairs', '12', '--everything', file=tmp_path / 'memory.json')
-    assert found['answered'] >= 6 and len(found['resident']) == 12 and '12 pairs of 512 px' in out
+    assert found['answered'] >= 6 and len(found['resident']) == 12 and '12 pairs of 1024 px' in out

@@ -72,7 +72,7 @@ def _add_latency(commands) -> None:
     command.add_argument('--seconds', type=_positive, default=60.0, metavar='S', help='at each rate (default: 60)')
     command.add_argument('--as-shipped', action='store_true', help='Fast DDS as it comes, without this package\'s profile for megapixel images')
     command.add_argument('--full', action='store_true', help='parameter tracking off: every pair is searched from scratch')
-    _add_node_options(command, size=1024)
+    _add_node_options(command)
     command.set_defaults(body=_latency)
 
 
@@ -81,12 +81,12 @@ def _add_memory(commands) -> None:
     command = commands.add_parser('memory', help=text, description=f'{text[0].upper()}{text[1:]}: it runs as a process of its own, on real topics.')
     command.add_argument('--pairs', type=_count, default=10_000, metavar='N', help='(default: 10000)')
     command.add_argument('--everything', action='store_true', help='subscribe to overlays, markers and points too')
-    _add_node_options(command, size=512)
+    _add_node_options(command)
     command.set_defaults(body=_memory)
 
 
-def _add_node_options(command: argparse.ArgumentParser, size: int) -> None:
-    command.add_argument('--size', type=_count, default=size, metavar='PX', help=f'of the images (default: {size})')
+def _add_node_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument('--size', type=_count, default=1024, metavar='PX', help='of the images (default: 1024)')
     command.add_argument('--rendered', type=_count, default=32, metavar='N', help='pairs that are rendered beforehand and played forth and back (default: 32)')
     command.add_argument('--seed', type=_seed, default=DEVICE, help='another seed is another device and anatomy')
     command.add_argument('--domain', type=int, choices=range(233), default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
