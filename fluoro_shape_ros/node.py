@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import re
 import signal
@@ -86,6 +87,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
         return _refuse(message)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    gc.freeze()     # what the imports left stays anyway: to look through all of it now and then would hold up a pair for some 50 ms
     try:
         if not told_to_stop.is_set():   # it may have come before rclpy's handlers
             executor.spin()
