@@ -57,6 +57,11 @@ class BagReader:
         """Log time of the first message."""
         return self._reader.start_time if self._reader else self._salvaged().start_ns
 
+    @property
+    def end_ns(self) -> int:
+        """Just after the log time of the last message."""
+        return self._reader.end_time if self._reader else self._salvaged().end_ns
+
     def types(self) -> dict[str, str]:
         """Topic to message type, of everything recorded."""
         return {topic: kind for topic, (kind, _) in self._topics.items()}
@@ -77,7 +82,7 @@ class BagReader:
                 continue
             yield Recorded(topic, log_ns, message, raw)
         missing = self.count(topics) - seen
-        if missing > 0 and start_ns is None and stop_ns is None:
+        if missing > 0 and (start_ns or 0) <= self.start_ns and (stop_ns is None or stop_ns >= self.end_ns):
             self._note(f'{missing} of {self.count(topics)} messages are not there')
 
     def close(self) -> None:

@@ -33,13 +33,12 @@ class Salvage:
         self._files = storage_files(path)
         self._stack = contextlib.ExitStack()
         self.topics: dict[str, tuple[str, int]] = {}    # name -> type and number of readable messages
-        self.start_ns = 0                               # log time of the first one
         self._unpacked = [self._unpack(file) for file in self._files]
         times = []
         for topic, kind, log_ns, _ in self._all():
             self.topics[topic] = kind, self.topics.get(topic, (kind, 0))[1] + 1
             times.append(log_ns)
-        self.start_ns = min(times, default=0)
+        self.start_ns, self.end_ns = min(times, default=0), max(times, default=-1) + 1     # log time of the first, and just after the last
 
     def close(self) -> None:
         self._stack.close()

@@ -15,7 +15,7 @@ from recording import IMAGE, INFO, RADIUS, SECOND, SKEW, main, outcomes, read, r
 from scipy.spatial import cKDTree                                       # noqa: E402
 
 from fluoro_shape_ros.config import Config, ConfigError                 # noqa: E402
-from fluoro_shape_ros.tools import replay                               # noqa: E402
+from fluoro_shape_ros.tools import offline                               # noqa: E402
 from fluoro_shape_ros.tools.parameters import read_parameters           # noqa: E402
 from msg_adapters.bags import create_bag                      # noqa: E402
 from msg_adapters.calibration import calibration_to_camera_info         # noqa: E402
@@ -125,8 +125,8 @@ def test_a_mask_and_a_later_part_of_the_bag(tmp_path):
 
 @pytest.mark.parametrize('tracking, previous', [('true', [False, True, True]), ('false', [False] * 3)])
 def test_tracking_can_be_switched_off(tmp_path, monkeypatch, tracking, previous):
-    seen, intact = [], replay.reconstruct
-    monkeypatch.setattr(replay, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None) or intact(frame, config, prior))
+    seen, intact = [], offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None) or intact(frame, config, prior))
     record(tmp_path / 'run', [GOOD] * 3)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', f'tracking={tracking}') == 0
     assert seen == previous
@@ -179,8 +179,8 @@ def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, ca
 
 def test_a_camera_holds_from_its_stamp_on():
     known = [(10, 'first'), (20, 'second'), (30, 'third')]
-    assert [replay.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)] == ['first', 'first', 'first', 'second', 'second', 'third', 'third']
-    assert replay.camera_at([], 5) is None
+    assert [offline.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)] == ['first', 'first', 'first', 'second', 'second', 'third', 'third']
+    assert offline.camera_at([], 5) is None
 
 
 def test_a_bag_that_loops(tmp_path, capsys):
@@ -197,8 +197,8 @@ def test_an_error_of_the_program_costs_its_pair_and_the_exit_code(run, tmp_path,
         if frame.stamp_ns == 5_100_000_000:
             raise ZeroDivisionError('a bug')
         return intact(frame, config, prior)
-    intact = replay.reconstruct
-    monkeypatch.setattr(replay, 'reconstruct', broken)
+    intact = offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', broken)
     assert main(run, '--out', tmp_path / 'out') == 1
     assert outcomes(tmp_path / 'out') == {5 * SECOND: 'ok', 5_100_000_000: 'internal_error', 5_200_000_000: 'ok'}
     assert 'ZeroDivisionError: a bug (stamp 5.100 s)' in capsys.readouterr().err

@@ -62,8 +62,8 @@ def _rate(text: str) -> float:
 
 
 def _import(args) -> None:
-    need('rosbags.highlevel', 'bags')
-    need('yaml', 'bags')
+    for module in ('rosbags.highlevel', 'mcap.stream_reader', 'yaml'):
+        need(module, 'bags')
     from msg_adapters.bags import BadBag, create_bag
 
     try:
