@@ -19,7 +19,9 @@ EXECUTABLES = {
 WHEELS = '; sys_platform == "linux" and platform_machine == "x86_64"'
 EXTRAS = {
     'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp')],
-    'bags': ['rosbags>=0.10', 'pyyaml>=6.0'],
+    'bags': ['rosbags>=0.10', 'mcap>=1.2', 'pyyaml>=6.0'],
+    'report': ['plotly>=5.18'],
+    'dicom': ['pydicom>=3.0', 'python-gdcm>=3.0.24'],     # GDCM decodes the lossless JPEG that most angiographs write
     'vtk': ['vtk>=9.3'],
     'plot': ['matplotlib>=3.6'],
 }
@@ -42,7 +44,7 @@ setup(
     packages=find_packages(include=[f'{NAME}*', 'msg_adapters*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml', *sorted(glob('resource/*.xml') + glob('resource/*.yaml') + glob('resource/*.rviz') + glob('resource/*.json'))]),
+        (f'share/{NAME}', ['package.xml', *sorted(glob('resource/*.xml') + glob('resource/*.yaml') + glob('resource/*.rviz') + glob('resource/*.json') + glob('resource/*.html'))]),
         # `ros2 run` looks in lib/<package>; pip puts the entry points below in bin/ only
         (f'lib/{NAME}', [f'resource/bin/{name}' for name in EXECUTABLES]),
     ],

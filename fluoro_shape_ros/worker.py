@@ -88,7 +88,9 @@ def view_of(camera: Camera, plane: str, image_shape: tuple[int, int], rectified:
 
 
 def decode(msg) -> np.ndarray:
-    """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage. Raises BadImage."""
+    """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage, or of what was decoded before. Raises BadImage."""
+    if isinstance(msg, np.ndarray):
+        return msg
     return image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg)
 
 

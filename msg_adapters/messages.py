@@ -50,13 +50,23 @@ def _ros_value(kind: str, value):
 def bag_message(typestore) -> New:
     """A factory of the messages that `typestore` (of rosbags) knows; these dataclasses need every field and numpy arrays."""
 
+    @functools.cache
+    def plan(type_name: str):
+        """The class, its fields, and which of them are numeric sequences, of what type; a Path asks for the same four hundreds of times."""
+        kinds = dict(typestore.fielddefs[type_name][1])
+        numeric = {name: _dtype(detail[0][1][0]) for name, (node, detail) in kinds.items() if node.name in ('ARRAY', 'SEQUENCE') and _is_numeric(detail[0])}
+        return typestore.types[type_name], kinds, numeric
+
     def new(type_name: str, **fields):
-        kinds = typestore.fielddefs[type_name][1]
-        unknown = set(fields) - {name for name, _ in kinds}
-        if unknown:
-            raise TypeError(f'{type_name} has no field {", ".join(sorted(unknown))}')
-        values = {name: _bag_value(new, kind, fields[name]) if name in fields else _bag_default(new, kind) for name, kind in kinds}
-        return typestore.types[type_name](**values)
+        cls, kinds, numeric = plan(type_name)
+        if fields.keys() != kinds.keys():
+            unknown = fields.keys() - kinds.keys()
+            if unknown:
+                raise TypeError(f'{type_name} has no field {", ".join(sorted(unknown))}')
+            fields = {name: fields[name] if name in fields else _bag_default(new, kind) for name, kind in kinds.items()}
+        for name, dtype in numeric.items():
+            fields[name] = np.ascontiguousarray(fields[name], dtype).ravel()
+        return cls(**fields)
 
     return new
 
@@ -69,13 +79,6 @@ def _is_numeric(kind) -> bool:
 
 def _dtype(name: str) -> np.dtype:
     return np.dtype({'byte': 'uint8', 'octet': 'uint8', 'char': 'uint8'}.get(name, name))
-
-
-def _bag_value(new: New, kind, value):
-    node, detail = kind
-    if node.name in ('ARRAY', 'SEQUENCE') and _is_numeric(detail[0]):
-        return np.ascontiguousarray(value, _dtype(detail[0][1][0])).ravel()
-    return value
 
 
 def _bag_default(new: New, kind):

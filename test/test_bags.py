@@ -1,5 +1,9 @@
 """Bags there and back in both storages, and what is wrong with damaged ones."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -112,40 +116,80 @@ def test_nothing_stays_of_a_bag_that_ends_in_an_error(tmp_path):
 
 
 def read_all(path):
+    """The stamps of what can be read, and the damage."""
     with open_bag(path) as bag:
-        return [image_to_array(r.message) for r in bag.messages([TOPIC])]
+        return [stamp_ns(r.message) for r in bag.messages([TOPIC])], bag.damage
+
+
+def cut(path, kept):
+    """Cut the storage file of a bag off."""
+    file = next(p for p in path.iterdir() if p.suffix != '.yaml')
+    file.write_bytes(file.read_bytes()[:int(kept * file.stat().st_size)])
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('kept', [0.0, 0.01, 0.5])
-def test_a_truncated_bag_is_named(tmp_path, storage, kept):
+@pytest.mark.parametrize('kept', [0.0, 0.01])
+def test_a_bag_of_which_nothing_is_left_is_named(tmp_path, storage, kept):
     path = write(tmp_path / 'run', storage)
-    file = next(p for p in path.iterdir() if p.suffix != '.yaml')
-    data = file.read_bytes()
-    file.write_bytes(data[:int(kept * len(data))])
+    cut(path, kept)
     with pytest.raises(BadBag, match='run: can\'t be read as a bag') as error:
         read_all(path)
     assert '\n' not in str(error.value)
 
 
-@pytest.mark.parametrize('kept', [0.7, 0.9, 0.98])
-def test_no_message_is_lost_silently(tmp_path, kept):
-    """sqlite3 opens a truncated file and tells only when it needs what is missing."""
-    path = write(tmp_path / 'run', 'sqlite3', stamps=range(10, 60))
-    file = path / 'run.db3'
-    file.write_bytes(file.read_bytes()[:int(kept * file.stat().st_size)])
-    try:
-        assert len(read_all(path)) == 50
-    except BadBag:
-        pass
+LONG = range(10, 810)       # of images of 4 KB: several chunks of an MCAP file
 
 
-def test_fewer_messages_than_announced_are_an_error(tmp_path):
+@pytest.mark.parametrize('storage, kept', [('mcap', 0.5), ('mcap', 0.99), ('sqlite3', 0.8), ('sqlite3', 0.99)])
+def test_what_is_left_of_a_truncated_bag_is_read(tmp_path, storage, kept):
+    path = write(tmp_path / 'run', storage, LONG)
+    cut(path, kept)
+    stamps, damage = read_all(path)
+    assert stamps == list(LONG)[:len(stamps)] and 1 >= len(stamps) / len(LONG) > kept - 0.35    # the last chunk of 1 MB is lost
+    assert 'run: damaged: ' in damage and '\n' not in damage
+
+
+def test_a_bag_that_lost_its_metadata_is_read(tmp_path):
+    """As a recording that was killed leaves it."""
+    path = write(tmp_path / 'run')
+    (path / 'metadata.yaml').unlink()
+    stamps, damage = read_all(path)
+    assert stamps == [10, 20, 30] and 'metadata' in damage
+
+
+def test_a_bad_chunk_in_the_middle_costs_only_itself(tmp_path):
+    path = write(tmp_path / 'run', 'mcap', LONG)
+    file = path / 'run.mcap'
+    data = bytearray(file.read_bytes())
+    middle = data.index(b'\x05', len(data) // 2 - 4096)    # a record somewhere in the second chunk
+    data[middle:middle + 300] = b'\xff' * 300
+    file.write_bytes(data)
+    stamps, damage = read_all(path)
+    assert len(LONG) // 2 <= len(stamps) <= len(LONG) and stamps[0] == LONG[0] and stamps[-1] == LONG[-1]
+    assert len(set(stamps)) == len(stamps) and damage == '' if len(stamps) == len(LONG) else damage
+
+
+def test_compressed_bags_that_are_cut_off(tmp_path):
+    types = get_typestore(Stores.ROS2_JAZZY)
+    for mode in (CompressionMode.FILE, CompressionMode.MESSAGE):
+        path = tmp_path / mode.name
+        writer = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            connection = writer.add_connection(TOPIC, 'sensor_msgs/msg/Image', typestore=types)
+            for stamp in LONG[:200]:
+                writer.write(connection, stamp, types.serialize_cdr(array_to_image(PIXELS, stamp, 'f', bag_message(types)), connection.msgtype))
+        cut(path, 0.9)
+        stamps, damage = read_all(path)
+        assert stamps == list(LONG)[:len(stamps)] and len(stamps) > 10 and damage, mode
+
+
+def test_fewer_messages_than_announced_are_named(tmp_path):
     path = write(tmp_path / 'run')
     metadata = path / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace('message_count: 3', 'message_count: 5'))
-    with pytest.raises(BadBag, match='2 of 5 messages are not there'):
-        read_all(path)
+    stamps, damage = read_all(path)
+    assert stamps == [10, 20, 30] and '2 of 5 messages are not there' in damage
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -159,10 +203,22 @@ def test_a_bag_with_garbage_in_it_never_ends_in_another_error(tmp_path, storage)
         broken[start:start + 64] = rng.bytes(64)
         file.write_bytes(broken)
         try:
-            read_all(path)      # pixels may change unseen
-        except ValueError:      # BadBag or BadImage
+            named += bool(read_all(path)[1])        # pixels may change unseen
+        except BadBag:
             named += 1
     assert named
+
+
+def test_a_full_disk_is_named(tmp_path):
+    """A limit of the file size stands in for the disk's; in a process of its own, which it holds for."""
+    code = ('import resource, sys\nfrom test_bags import write\nresource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n'
+            'try:\n    write(sys.argv[1], sys.argv[2], range(10, 2010))\nexcept ValueError as error:\n    print(type(error).__name__, error)\n')
+    for storage in ('mcap', 'sqlite3'):
+        path = tmp_path / storage
+        done = subprocess.run([sys.executable, '-c', f'import sys\nsys.path[:0] = {[*sys.path, str(Path(__file__).parent)]!r}\n{code}', str(path), storage],
+                              capture_output=True, text=True, timeout=120)
+        assert done.stdout.startswith(f'BadBag {path}: can\'t be written (') and not done.stderr, done
+        assert not path.exists()
 
 
 @pytest.mark.parametrize('make, says', [

@@ -1,5 +1,6 @@
 """fluoro_shape_replay: a bag of drawn pairs in, results out."""
 
+import csv
 import subprocess
 import sys
 
@@ -15,9 +16,9 @@ from recording import IMAGE, INFO, RADIUS, SECOND, SKEW, main, outcomes, read, r
 from scipy.spatial import cKDTree                                       # noqa: E402
 
 from fluoro_shape_ros.config import Config, ConfigError                 # noqa: E402
-from fluoro_shape_ros.tools import replay                               # noqa: E402
+from fluoro_shape_ros.tools import offline                               # noqa: E402
 from fluoro_shape_ros.tools.parameters import read_parameters           # noqa: E402
-from msg_adapters.bags import create_bag                      # noqa: E402
+from msg_adapters.bags import create_bag, open_bag                      # noqa: E402
 from msg_adapters.calibration import calibration_to_camera_info         # noqa: E402
 from msg_adapters.images import array_to_image                          # noqa: E402
 from msg_adapters.messages import stamp_ns                              # noqa: E402
@@ -125,8 +126,8 @@ def test_a_mask_and_a_later_part_of_the_bag(tmp_path):
 
 @pytest.mark.parametrize('tracking, previous', [('true', [False, True, True]), ('false', [False] * 3)])
 def test_tracking_can_be_switched_off(tmp_path, monkeypatch, tracking, previous):
-    seen, intact = [], replay.reconstruct
-    monkeypatch.setattr(replay, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None) or intact(frame, config, prior))
+    seen, intact = [], offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None) or intact(frame, config, prior))
     record(tmp_path / 'run', [GOOD] * 3)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', f'tracking={tracking}') == 0
     assert seen == previous
@@ -136,6 +137,76 @@ def test_compressed_images(tmp_path):
     record(tmp_path / 'run', [GOOD], compressed=True)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', 'image_transport=compressed') == 0
     assert list(outcomes(tmp_path / 'out').values()) == ['ok']
+
+
+def test_topics_are_remapped_as_for_the_node(run, tmp_path):
+    """Inputs and outputs, relative and absolute, with the node's own syntax."""
+    with open_bag(run) as bag, create_bag(tmp_path / 'cell') as out:
+        for topic, kind in bag.types().items():
+            out.declare(f'/xray{topic}', kind)
+        for r in bag.messages(bag.types()):
+            out.write_raw(f'/xray{r.topic}', r.raw, r.log_ns)
+    rules = [word for p in 'ab' for topic in ('image_raw', 'camera_info') for word in ('-r', f'plane_{p}/{topic}:=/xray/plane_{p}/{topic}')]
+    assert main(tmp_path / 'cell', '--out', tmp_path / 'out', '--ros-args', *rules, '-r', 'backbone:=robot/shape', '-p', 'tracking:=false') == 0
+    topics = set(read(tmp_path / 'out'))
+    assert topics == {'/robot/shape', '/tip', '/tip_pose', '/backbone_points', '/diagnostics'}
+
+
+def test_what_is_left_of_a_damaged_bag_is_replayed(tmp_path, capsys):
+    record(tmp_path / 'run', [GOOD] * 12)       # of 200 KB a pair: MCAP chunks of 1 MB
+    file = tmp_path / 'run' / 'run.mcap'
+    file.write_bytes(file.read_bytes()[:-150_000])
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '--csv', tmp_path / 'out.csv') == 1
+    error = capsys.readouterr().err
+    assert 'run: damaged: ' in error and len(error.splitlines()) == 1
+    found = outcomes(tmp_path / 'out')
+    assert 3 <= len(found) < 12 and set(found.values()) == {'ok'}
+    assert (tmp_path / 'out.csv').exists()
+
+
+def test_ctrl_c_keeps_what_was_computed(run, tmp_path, monkeypatch):
+    def interrupted(frame, config, prior):
+        if frame.stamp_ns == 5_200_000_000:
+            raise KeyboardInterrupt
+        return intact(frame, config, prior)
+    intact = offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', interrupted)
+    assert main(run, '--out', tmp_path / 'out', '--npz', tmp_path / 'out.npz') == 130
+    assert list(outcomes(tmp_path / 'out').values()) == ['ok', 'no_device_in_plane_a']
+    assert list(np.load(tmp_path / 'out.npz')['outcome']) == ['ok', 'no_device_in_plane_a']
+
+
+def test_tables_for_other_programs(run, tmp_path):
+    """CSV and NPZ say the same as the bag, and the same bytes every time."""
+    for folder in ('first', 'second'):
+        (tmp_path / folder).mkdir()
+        assert main(run, '--out', tmp_path / folder / 'out', '--csv', tmp_path / folder / 'out.csv', '--npz', tmp_path / folder / 'out.npz', '-p', BASE) == 0
+    assert all((tmp_path / 'first' / name).read_bytes() == (tmp_path / 'second' / name).read_bytes() for name in ('out.csv', 'out.npz'))
+    paths = [path_to_points(path) for _, path in read(tmp_path / 'first' / 'out')['/backbone']]
+    with (tmp_path / 'first' / 'out.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ['stamp_s', 'outcome', 's_m', 'x_m', 'y_m', 'z_m', 'sigma_m', 'residual_a_px', 'residual_b_px', 'reason']
+    points = np.array([[row[f'{axis}_m'] or 'nan' for axis in 'xyz'] for row in rows], float)
+    n = len(paths[0])
+    assert np.allclose(points[:n], paths[0], atol=1e-9) and np.allclose(points[n + 1:], paths[1], atol=1e-9)
+    assert {row['stamp_s'] for row in rows[:n]} == {'5.000000000'} and float(rows[n - 1]['s_m']) == pytest.approx(0.1, abs=0.01)
+    assert (rows[n]['outcome'], rows[n]['stamp_s'], rows[n]['x_m']) == ('no_device_in_plane_a', '5.100000000', '') and rows[n]['reason']
+    arrays = np.load(tmp_path / 'first' / 'out.npz')
+    assert arrays['stamp_ns'].tolist() == [5 * SECOND, 5_100_000_000, 5_200_000_000] and arrays['outcome'][1] == 'no_device_in_plane_a'
+    assert np.array_equal(arrays['points_m'][arrays['pair'] == 2], paths[1]) and not (arrays['pair'] == 1).any()
+    assert arrays['residual_px'].shape == (2 * n, 2) and arrays['sigma_m'].shape == arrays['s_m'].shape == (2 * n,) and str(arrays['frame_id']) == 'plane_a_optical'
+
+
+def test_images_read_ahead_come_in_order_and_errors_in_their_turn():
+    def items():
+        yield from range(20)
+        raise OSError('at last')
+    taken = []
+    with pytest.raises(OSError, match='at last'):
+        for item in offline.ahead(items(), 3):
+            taken.append(item)
+    assert taken == list(range(20))
+    assert list(offline.ahead([], 3)) == []
 
 
 def test_other_topics(tmp_path, run):
@@ -179,8 +250,8 @@ def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, ca
 
 def test_a_camera_holds_from_its_stamp_on():
     known = [(10, 'first'), (20, 'second'), (30, 'third')]
-    assert [replay.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)] == ['first', 'first', 'first', 'second', 'second', 'third', 'third']
-    assert replay.camera_at([], 5) is None
+    assert [offline.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)] == ['first', 'first', 'first', 'second', 'second', 'third', 'third']
+    assert offline.camera_at([], 5) is None
 
 
 def test_a_bag_that_loops(tmp_path, capsys):
@@ -197,8 +268,8 @@ def test_an_error_of_the_program_costs_its_pair_and_the_exit_code(run, tmp_path,
         if frame.stamp_ns == 5_100_000_000:
             raise ZeroDivisionError('a bug')
         return intact(frame, config, prior)
-    intact = replay.reconstruct
-    monkeypatch.setattr(replay, 'reconstruct', broken)
+    intact = offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', broken)
     assert main(run, '--out', tmp_path / 'out') == 1
     assert outcomes(tmp_path / 'out') == {5 * SECOND: 'ok', 5_100_000_000: 'internal_error', 5_200_000_000: 'ok'}
     assert 'ZeroDivisionError: a bug (stamp 5.100 s)' in capsys.readouterr().err
@@ -249,6 +320,11 @@ def test_as_a_process(run, tmp_path):
     (['run', '--start', '-1'], 2, '--start'),
     (['run', '--mask', '1', '--duration', '0.5'], 2, '--mask: nothing is left'),
     (['run', '--mask', '9'], 1, '--mask 9: no pair comes after the 3 that made the mask'),
+    (['run', '-r', 'plane_c/image_raw:=/x'], 2, '-r plane_c/image_raw:=/x: there is no topic plane_c/image_raw; those are plane_a/image_raw, '),
+    (['run', '-r', 'tip'], 2, '-r tip: needs the form FROM:=TO'),
+    (['run', '-r', 'tip:=backbone'], 2, 'two results have the same topic'),
+    (['run', '--csv', 'run'], 1, 'run exists already'),
+    (['run', '--npz', 'none/out.npz'], 1, 'none/out.npz: there is no folder none'),
     ([], 2, 'required'),
 ], ids=lambda value: ' '.join(value) if isinstance(value, list) else '')
 def test_what_can_not_work_is_said_in_one_line(run, tmp_path, monkeypatch, capsys, arguments, code, says):

@@ -38,11 +38,16 @@ class CArm:
         return self.pixel_size_iso * self.sid / self.sod
 
 
-def view(name: str, primary: float, secondary: float = 0.0, arm: CArm = CArm()) -> View:
-    """The view of plane `name` at two C-arm angles (rad); the principal point is the image centre."""
+def camera_from_patient(primary: float, secondary: float) -> np.ndarray:
+    """(3, 3) rotation of the reference frame into the camera's at two C-arm angles (rad); its rows are u and v as seen from the source, and the beam."""
     beam = np.array([np.sin(primary) * np.cos(secondary), -np.cos(primary) * np.cos(secondary), np.sin(secondary)])
     right = np.array([-np.cos(primary), -np.sin(primary), 0.0])
-    R = np.stack([right, np.cross(beam, right), beam])
+    return np.stack([right, np.cross(beam, right), beam])
+
+
+def view(name: str, primary: float, secondary: float = 0.0, arm: CArm = CArm()) -> View:
+    """The view of plane `name` at two C-arm angles (rad); the principal point is the image centre."""
+    R = camera_from_patient(primary, secondary)
     f = arm.sid / arm.pixel_size
     K = np.array([[f, 0.0, (arm.width - 1) / 2], [0.0, f, (arm.height - 1) / 2], [0.0, 0.0, 1.0]])
     return make_view(name, K @ np.c_[R, [0.0, 0.0, arm.sod]], arm.width, arm.height)

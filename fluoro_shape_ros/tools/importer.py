@@ -1,14 +1,17 @@
-"""fluoro_shape_import: image files and a calibration file a plane in, a bag as `ros2 bag record` would have made out."""
+"""fluoro_shape_import: image files and a calibration file a plane, or two DICOM XA runs, in; a bag as `ros2 bag record` would have made out."""
 
 from __future__ import annotations
 
 import argparse
 import glob
+import heapq
 import re
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
 
 import cv2
@@ -23,35 +26,39 @@ from ..geometry import GeometryError, check_pair
 from .cli import ToolError, need, run
 
 PLANES = ('a', 'b')
+RATE_HZ = 15.0              # where nothing tells
 FIRST_STAMP_NS = 10**9      # a stamp of zero says nothing about time
 
 
 @dataclass(frozen=True)
 class Source:
-    """The images of one plane in order, with their camera, whatever files they come from."""
+    """The images of one plane in order, with their cameras, whatever files they come from."""
 
-    calibration: Calibration
     count: int
-    frames: Iterable[np.ndarray]    # (H, W) uint8, uint16 or float32, read when asked for
+    calibrations: Iterable[Calibration]     # one an image
+    frames: Iterable[np.ndarray]            # (H, W) uint8, uint16 or float32, read when asked for
+    times_ns: list[int] | None = None       # of the images; None: the files do not tell
 
 
 def main(argv=None) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog='fluoro_shape_import', description='Make a bag of biplane images: image files and a camera_info YAML file a plane.')
+    parser = argparse.ArgumentParser(prog='fluoro_shape_import',
+                                     description='Make a bag of biplane images: image files and a camera_info YAML file a plane, or two DICOM XA runs.')
     for plane in PLANES:
-        parser.add_argument(f'--plane-{plane}', nargs='+', required=True, metavar='FILES',
+        parser.add_argument(f'--plane-{plane}', nargs='+', metavar='FILES',
                             help=f'images of plane {plane.upper()} in order of time: files, patterns, or folders (sorted by name, numbers by value)')
-        parser.add_argument(f'--camera-{plane}', required=True, metavar='YAML', help=f'calibration of plane {plane.upper()}')
+        parser.add_argument(f'--camera-{plane}', metavar='YAML', help=f'calibration of plane {plane.upper()}')
+    parser.add_argument('--dicom', nargs=2, metavar=('A', 'B'), help='the runs of both planes, instead of the above; cameras and times are in them')
     parser.add_argument('--out', required=True, metavar='BAG', help='the bag to make, a new folder')
     parser.add_argument('--storage', choices=('mcap', 'sqlite3'), help='default: sqlite3 if BAG ends in .db3, else mcap')
     times = parser.add_mutually_exclusive_group()
-    times.add_argument('--rate', type=_rate, default=15.0, metavar='HZ', help='pairs per second (default: %(default)g)')
+    times.add_argument('--rate', type=_rate, metavar='HZ', help=f'pairs per second (default: what DICOM files say, else {RATE_HZ:g})')
     times.add_argument('--stamps', metavar='FILE', help='text file with the time of each pair in seconds, one a line')
     parser.add_argument('--frame-ids', nargs=2, default=['plane_a_optical', 'plane_b_optical'], metavar=('A', 'B'),
                         help='frame_id of each plane (default: plane_a_optical plane_b_optical)')
     # what OpenCV (4 or 5) would say of a bad file is ours to say, in one line
     (cv2.setLogLevel if hasattr(cv2, 'setLogLevel') else cv2.utils.logging.setLogLevel)(0)
-    return run(_import, parser, argv)
+    return run(lambda args: _import(args, parser), parser, argv)
 
 
 def _rate(text: str) -> float:
@@ -61,23 +68,50 @@ def _rate(text: str) -> float:
     return rate
 
 
-def _import(args) -> None:
-    need('rosbags.highlevel', 'bags')
-    need('yaml', 'bags')
+def _import(args, parser: argparse.ArgumentParser) -> None:
+    images = [getattr(args, f'{what}_{p}') for p in PLANES for what in ('plane', 'camera')]
+    if args.dicom and any(images) or not args.dicom and not all(images):
+        parser.error('--plane-a, --camera-a, --plane-b and --camera-b are required, or else --dicom alone')
+    for module in ('rosbags.highlevel', 'mcap.stream_reader', 'yaml'):
+        need(module, 'bags')
+    if args.dicom:
+        need('pydicom.pixels', 'dicom')
     from msg_adapters.bags import BadBag, create_bag
 
+    from .dicom import BadDicom
+
     try:
-        sources = [image_source(find_files(getattr(args, f'plane_{p}')), read_calibration(getattr(args, f'camera_{p}'))) for p in PLANES]
-        if sources[0].count != sources[1].count:
+        sources = dicom_sources(args.dicom) if args.dicom else [
+            image_source(find_files(getattr(args, f'plane_{p}')), read_calibration(getattr(args, f'camera_{p}'))) for p in PLANES]
+        if sources[0].count != sources[1].count and not args.dicom:
             raise ToolError(f'plane A has {sources[0].count} images, plane B {sources[1].count}: they can\'t be paired')
-        stamps_ns = read_stamps(args.stamps) if args.stamps else even_stamps(args.rate, sources[0].count)
-        if len(stamps_ns) != sources[0].count:
-            raise ToolError(f'{args.stamps} has {len(stamps_ns)} stamps for {sources[0].count} pairs')
         with create_bag(args.out, args.storage) as bag:
-            write_run(bag, sources, stamps_ns, args.frame_ids)
-    except (BadCalibration, BadCameraInfo, BadImage, BadBag, GeometryError) as error:
+            write_run(bag, sources, [stamps_of(source, args.rate, args.stamps) for source in sources], args.frame_ids)
+    except (BadCalibration, BadCameraInfo, BadImage, BadBag, BadDicom, GeometryError) as error:
         raise ToolError(str(error)) from error
-    print(f'{sources[0].count} pairs in {args.out}')
+    counts = sorted({source.count for source in sources})
+    print(f'{counts[0]} pairs in {args.out}' + (f' (the other plane has {counts[1]} images)' if len(counts) > 1 else ''))
+
+
+def dicom_sources(paths: list[str]) -> list[Source]:
+    """Planes A and B of two XA files. Raises BadDicom."""
+    from .dicom import in_order, read_run
+    from .dicom_pixels import pictures
+
+    runs = in_order([read_run(path) for path in paths])
+    return [Source(len(r.calibrations), r.calibrations, pictures(r), None if r.times_ns is None else (FIRST_STAMP_NS + r.times_ns).tolist()) for r in runs]
+
+
+def stamps_of(source: Source, rate_hz: float | None, path: str | None) -> list[int]:
+    """Stamps in ns of the images of a plane: from the file at `path`, at a rate, or as their files say. Raises ToolError."""
+    if path:
+        stamps_ns = read_stamps(path)
+        if len(stamps_ns) != source.count:
+            raise ToolError(f'{path} has {len(stamps_ns)} stamps for {source.count} pairs')
+        return stamps_ns
+    if rate_hz is None and source.times_ns is not None:
+        return source.times_ns
+    return even_stamps(rate_hz or RATE_HZ, source.count)
 
 
 def find_files(patterns: list[str]) -> list[Path]:
@@ -105,7 +139,7 @@ def image_source(files: list[Path], calibration: Calibration) -> Source:
     Raises BadImage where a file is no image, here or when it is read, and OSError where it can't be opened.
     """
     pages = [_count_pages(file) for file in files]
-    return Source(calibration, sum(pages), _read_pages(files, pages))
+    return Source(sum(pages), repeat(calibration), _read_pages(files, pages))
 
 
 def _count_pages(file: Path) -> int:
@@ -152,24 +186,25 @@ def even_stamps(rate_hz: float, count: int) -> list[int]:
     return [FIRST_STAMP_NS + round(k * 1e9 / rate_hz) for k in range(count)]
 
 
-def write_run(bag, sources: list[Source], stamps_ns: list[int], frame_ids: list[str]) -> None:
-    """Write both planes to `bag` (of create_bag): per pair and plane a camera info and an image with the pair's stamp.
+def write_run(bag, sources: list[Source], stamps_ns: list[list[int]], frame_ids: list[str]) -> None:
+    """Write both planes to `bag` (of create_bag) in the order of their stamps: with every image its camera info.
 
-    Raises BadImage for an image that can't be read, BadCameraInfo for a camera that can't be one or not this image's, GeometryError for
-    planes that can't see depth.
+    Raises BadImage and BadDicom for an image that can't be read, BadCameraInfo for a camera that can't be one or not this image's,
+    GeometryError for planes that can't see depth.
     """
     for plane in PLANES:
         bag.declare(f'/plane_{plane}/camera_info', 'sensor_msgs/msg/CameraInfo')
         bag.declare(f'/plane_{plane}/image_raw', 'sensor_msgs/msg/Image')
-    pairs = zip(stamps_ns, *(source.frames for source in sources))
-    for stamp_ns, *images in tqdm(pairs, 'importing', len(stamps_ns), unit='pair', disable=None):
-        views = []
-        for plane, image, source, frame_id in zip(PLANES, images, sources, frame_ids):
-            info = calibration_to_camera_info(source.calibration, stamp_ns, frame_id, bag.new)
-            views.append(camera_info_to_view(info, plane, image.shape))
-            bag.write(f'/plane_{plane}/camera_info', info, stamp_ns)
-            bag.write(f'/plane_{plane}/image_raw', array_to_image(image, stamp_ns, frame_id, bag.new), stamp_ns)
-        check_pair(tuple(views))
+    views = {}
+    entries = heapq.merge(*(zip(stamps, repeat(k), s.calibrations, s.frames) for k, (s, stamps) in enumerate(zip(sources, stamps_ns))), key=itemgetter(0, 1))
+    for stamp_ns, k, calibration, image in tqdm(entries, 'importing', sum(map(len, stamps_ns)), unit='image', disable=None):
+        plane, frame_id = PLANES[k], frame_ids[k]
+        info = calibration_to_camera_info(calibration, stamp_ns, frame_id, bag.new)
+        views[plane] = camera_info_to_view(info, plane, image.shape)
+        bag.write(f'/plane_{plane}/camera_info', info, stamp_ns)
+        bag.write(f'/plane_{plane}/image_raw', array_to_image(image, stamp_ns, frame_id, bag.new), stamp_ns)
+        if len(views) == 2:
+            check_pair(tuple(views[p] for p in PLANES))
 
 
 if __name__ == '__main__':

@@ -7,59 +7,32 @@ are most of a bag, and `ros2 bag play` plays two bags at once.
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import contextlib
 import math
 import sys
-from bisect import bisect_right
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import lru_cache
-from operator import itemgetter
-
-import cv2
-from tqdm import tqdm
+from collections.abc import Iterable
+from pathlib import Path
 
 from msg_adapters import shapes
-from msg_adapters.cameras import BadCameraInfo
-from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, Tally, diagnostic_array
-from msg_adapters.messages import stamp_ns
+from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, diagnostic_array
 
 from ..config import Config, ConfigError
-from ..data import Frame, Outcome, Reconstruction
-from ..pairing import PLANES, Counts, Pairer
-from ..pipeline import reconstruct
-from ..worker import Camera, Job, Memory, adapt, camera, checked_camera, image_window, view_of
+from ..data import Outcome
+from ..pairing import PLANES
 from .cli import ToolError, need, run
+from .exports import Arrays, Table
+from .offline import Answer, Offline, Summary, Topics
 from .parameters import NODE, read_parameters
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+DIAGNOSTICS = '/diagnostics'
 RESULTS = {     # topic -> type, adapter
-    '/backbone': ('nav_msgs/msg/Path', shapes.shape_to_path),
-    '/tip': ('geometry_msgs/msg/PointStamped', shapes.shape_to_tip),
-    '/tip_pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', shapes.shape_to_tip_pose),
-    '/backbone_points': ('sensor_msgs/msg/PointCloud2', shapes.shape_to_cloud),
+    'backbone': ('nav_msgs/msg/Path', shapes.shape_to_path),
+    'tip': ('geometry_msgs/msg/PointStamped', shapes.shape_to_tip),
+    'tip_pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', shapes.shape_to_tip_pose),
+    'backbone_points': ('sensor_msgs/msg/PointCloud2', shapes.shape_to_cloud),
 }
-
-
-@dataclass
-class Summary:
-    """What became of a bag."""
-
-    counts: Counts = field(default_factory=Counts)
-    images: Counter = field(default_factory=Counter)        # by plane
-    outcomes: Counter = field(default_factory=Counter)      # by name
-    warnings: Counter = field(default_factory=Counter)
-    refused: dict[str, str] = field(default_factory=dict)   # plane -> why its last refused camera info was
-    masked: int = 0                                         # pairs that made the mask
-    bug: str = ''                                           # what went wrong in the first pair that ended in internal_error
-
-    def count(self, stamp: int, result: Reconstruction) -> None:
-        """One more pair came to an end."""
-        self.outcomes[result.outcome.value] += 1
-        self.warnings.update(result.warnings)
-        if result.outcome is Outcome.INTERNAL_ERROR:
-            self.bug = self.bug or f'{result.detail} (stamp {stamp / 1e9:.3f} s)'
+INPUTS = tuple(f'plane_{plane}/{what}' for plane in PLANES for what in ('image_raw', 'camera_info'))
 
 
 def main(argv=None) -> int:
@@ -69,15 +42,21 @@ def main(argv=None) -> int:
     parser.add_argument('--out', required=True, metavar='BAG', help='the bag to make, a new folder')
     parser.add_argument('--storage', choices=('mcap', 'sqlite3'), help='default: sqlite3 if the new bag ends in .db3, else mcap')
     parser.add_argument('--with-images', action='store_true', help='copy the images and camera infos too, logged at their stamps')
+    parser.add_argument('--report', metavar='HTML', help='make a page to look at: what became of the pairs, the tip\'s track, overlays, the backbone in 3-D over time')
+    parser.add_argument('--csv', metavar='FILE', help='write a table: a row a backbone point')
+    parser.add_argument('--npz', metavar='FILE', help='write NumPy arrays of all backbone points')
     parser.add_argument('--start', type=_seconds, default=0.0, metavar='S', help='skip the first S seconds')
     parser.add_argument('--duration', type=_seconds, default=math.inf, metavar='S', help='stop after S seconds')
     parser.add_argument('--mask', type=_seconds, default=0.0, metavar='S',
                         help='the first S seconds of the bag show no device: their mean is the mask image, subtracted from all later images')
     parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE', help='a parameter of fluoro_shape_node; may be repeated')
     parser.add_argument('--params', metavar='YAML', help='a ROS parameter file with the parameters of fluoro_shape')
+    parser.add_argument('-r', '--remap', action='append', default=[], metavar='FROM:=TO',
+                        help=f'another name for a topic, read ({", ".join(INPUTS)}) or written ({", ".join(RESULTS)}); may be repeated')
+    parser.add_argument('--ros-args', action='store_true', help=argparse.SUPPRESS)     # so that -p and -r can be given as to the node
     for plane in PLANES:
-        parser.add_argument(f'--image-{plane}', default=f'plane_{plane}/image_raw', metavar='TOPIC', help='images (default: %(default)s)')
-        parser.add_argument(f'--info-{plane}', default=f'plane_{plane}/camera_info', metavar='TOPIC', help='camera infos (default: %(default)s)')
+        parser.add_argument(f'--image-{plane}', metavar='TOPIC', help=f'the same as -r plane_{plane}/image_raw:=TOPIC')
+        parser.add_argument(f'--info-{plane}', metavar='TOPIC', help=f'the same as -r plane_{plane}/camera_info:=TOPIC')
     return run(lambda args: _body(args, parser), parser, argv)
 
 
@@ -88,174 +67,159 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _body(args, parser: argparse.ArgumentParser) -> None:
-    need('rosbags.highlevel', 'bags')
-    need('yaml', 'bags')
-    from msg_adapters.bags import BadBag, absolute, create_bag, open_bag
+def _body(args, parser: argparse.ArgumentParser) -> int:
+    for module in ('rosbags.highlevel', 'mcap.stream_reader', 'yaml'):
+        need(module, 'bags')
+    if args.report:
+        need('plotly.offline', 'report')
+    from msg_adapters.bags import BadBag
 
     try:
         config = Config.from_values(**read_parameters(args.params, args.param))
-    except ConfigError as error:
+        names = topic_names(args)
+    except ValueError as error:
         parser.error(str(error))
     if config.input.geometry == 'tf':
         parser.error('geometry: a replay takes the poses from CameraInfo alone (camera_info), not from tf')
     suffix = '/compressed' if config.input.image_transport == 'compressed' else ''
-    images = {absolute(getattr(args, f'image_{p}') + suffix): p for p in PLANES}
-    infos = {absolute(getattr(args, f'info_{p}')): p for p in PLANES}
-    if len(images) < 2 or len(infos) < 2:
+    topics = Topics({names[f'plane_{p}/image_raw'].removesuffix(suffix) + suffix: p for p in PLANES}, {names[f'plane_{p}/camera_info']: p for p in PLANES})
+    if len(topics.images) < 2 or len(topics.infos) < 2:
         parser.error('both planes have the same topic')
     if args.start + args.duration <= args.mask:
         parser.error('--mask: nothing is left to reconstruct before the end of --duration')
+    for path in filter(None, (args.report, args.csv, args.npz)):
+        if Path(path).exists():
+            raise ToolError(f'{path} exists already and is not overwritten')
+        if not Path(path).parent.is_dir():
+            raise ToolError(f'{path}: there is no folder {Path(path).parent}')
     try:
-        with open_bag(args.bag) as bag:
-            _check_topics(bag.types(), images, infos)
-            with create_bag(args.out, args.storage) as out:
-                summary = replay(bag, out, config, images, infos, (args.start, args.duration), args.with_images, args.mask)
+        return _replay(args, config, topics, names)
     except BadBag as error:
         raise ToolError(str(error)) from error
+
+
+def topic_names(args) -> dict[str, str]:
+    """The absolute name of each topic of the node, as remapped. Raises ConfigError for what is no rule."""
+    from msg_adapters.bags import absolute
+
+    names = {name: absolute(name) for name in (*INPUTS, *RESULTS)}
+    given = [(f'plane_{p}/{topic}', getattr(args, f'{what}_{p}')) for p in PLANES for what, topic in (('image', 'image_raw'), ('info', 'camera_info'))]
+    for text in args.remap:
+        name, rule, other = text.partition(':=')
+        name = name.strip('/').removesuffix('/compressed')
+        if not rule or not other.strip('/'):
+            raise ConfigError(f'-r {text}: needs the form FROM:=TO')
+        if name not in names:
+            raise ConfigError(f'-r {text}: there is no topic {name}; those are {", ".join(names)}')
+        given.append((name, other))
+    names |= {name: absolute(other) for name, other in given if other is not None}
+    written = [names[name] for name in RESULTS]
+    if len({*written, DIAGNOSTICS}) <= len(RESULTS):
+        raise ConfigError(f'-r: two results have the same topic ({", ".join(sorted(written))})')
+    return names
+
+
+def _replay(args, config: Config, topics: Topics, names: dict[str, str]) -> int:
+    """The work; the exit code. What was computed is kept when it is interrupted or something fails on the way."""
+    from msg_adapters.bags import create_bag, open_bag
+
+    failures, interrupted = [], False
+    with open_bag(args.bag) as bag:
+        check_topics(bag.types(), topics)
+        with create_bag(args.out, args.storage) as out:
+            history = None
+            sinks = [Results(out, names), *(kind(path) for kind, path in ((Table, args.csv), (Arrays, args.npz)) if path)]
+            if args.report:
+                from .history import History
+                history = History()
+                sinks.append(history)
+            offline = Offline(bag, config, topics, (args.start, args.duration), args.mask, copier(bag, out, topics) if args.with_images else None)
+            try:
+                feed(offline.answers(), sinks, failures)
+            except KeyboardInterrupt:
+                if not offline.summary.outcomes:
+                    raise
+                interrupted = True
+        if history is not None:
+            from .report import write_report
+            with _kept(failures):
+                write_report(args.report, history, offline, args.bag)
+        damage = bag.damage
+    summary = offline.summary
     print(report(summary, args.out))
     if summary.bug:
-        raise ToolError(f'{summary.outcomes[Outcome.INTERNAL_ERROR.value]} pairs ended in an error of the program, the first: {summary.bug}')
+        failures.append(f'{summary.outcomes[Outcome.INTERNAL_ERROR.value]} pairs ended in an error of the program, the first: {summary.bug}')
+    failures += filter(None, [damage])
+    if failures:
+        raise ToolError('; '.join(failures))
+    return 130 if interrupted else 0
 
 
-def _check_topics(types: dict[str, str], images: dict[str, str], infos: dict[str, str]) -> None:
+def feed(answers: Iterable[Answer], sinks: list, failures: list[str]) -> None:
+    """Give every answer to every sink, and close them; a sink that fails is left out from there on."""
+    try:
+        for answer in answers:
+            for sink in sinks[:]:
+                with _kept(failures, lambda sink=sink: sinks.remove(sink)):
+                    sink.take(answer)
+    finally:
+        for sink in sinks:
+            with _kept(failures):
+                sink.close()
+
+
+@contextlib.contextmanager
+def _kept(failures: list[str], then=lambda: None):
+    """A failure of one output is for the end: the others go on."""
+    try:
+        yield
+    except ToolError as error:
+        failures.append(str(error))
+        then()
+
+
+def check_topics(types: dict[str, str], topics: Topics) -> None:
     """Raises ToolError where a topic is not in the bag, or is something else; it tells what could be meant."""
-    for topics, fitting, what in ((images, IMAGE_TYPES, 'image'), (infos, ('sensor_msgs/msg/CameraInfo',), 'info')):
+    for named, fitting, what in ((topics.images, IMAGE_TYPES, 'image'), (topics.infos, ('sensor_msgs/msg/CameraInfo',), 'info')):
         known = ', '.join(sorted(t for t, kind in types.items() if kind in fitting)) or 'none'
-        for topic, plane in topics.items():
+        for topic, plane in named.items():
             if topic not in types:
                 raise ToolError(f'{topic} is not in the bag; name another with --{what}-{plane} (such topics in it: {known})')
             if types[topic] not in fitting:
                 raise ToolError(f'{topic} is a {types[topic]}; name another with --{what}-{plane} (fitting topics in the bag: {known})')
 
 
-def replay(bag, out, config: Config, images: dict[str, str], infos: dict[str, str], window: tuple[float, float] = (0.0, math.inf),
-           with_images: bool = False, mask_s: float = 0.0) -> Summary:
-    """Reconstruct every pair of `bag` (of open_bag) and write the results to `out` (of create_bag).
-
-    `images` and `infos` map topics to planes; `window` is the start and the duration in s. The pairs of the first `mask_s` of the bag
-    are not reconstructed: they make the mask of the others. Raises ToolError where no images pair, BadBag where the bag is damaged.
-    """
-    cv2.setNumThreads(config.input.threads or -1)   # 0 would mean none for OpenCV
-    for topic, (kind, _) in RESULTS.items():
-        out.declare(topic, kind)
-    out.declare('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray')
-    span = _span_ns(bag, window)
-    total = bag.count(images) if window == (0.0, math.inf) else None
-    if with_images:
-        _copy(bag, out, images, infos, span)
-
-    summary = Summary()
-    cameras = read_cameras(bag, config, infos, summary)
-    pairer, memory, views = Pairer(round(config.input.sync_slop * 1e9)), Memory(), lru_cache(maxsize=8)(view_of)
-
-    def jobs(what, total, start_ns, stop_ns):
-        stream = tqdm(bag.messages(images, start_ns, stop_ns), what, total, unit='image', disable=None)
-        for stamp_a, *pair in _pairs(stream, images, pairer, memory, summary):
-            held = tuple(camera_at(cameras[plane], stamp_ns(message)) for plane, message in zip(PLANES, pair))
-            yield Job(stamp_a, tuple(pair), held, config, memory.generation, 0.0)
-
-    if mask_s:
-        until_ns = bag.start_ns + round(mask_s * 1e9)
-        span, total = (max(span[0] or 0, until_ns), span[1]), None
-        summary.masked = take_mask(jobs('mask', None, None, until_ns), memory, views)
-        if not summary.masked:
-            raise ToolError(f'--mask {mask_s:g}: there is no usable pair in the first {mask_s:g} s of the bag')
-    for job in jobs('replaying', total, *span):
-        _, result = answer(job, memory, views)
-        write_result(out, job, result)
-        summary.count(job.stamp_ns, result)
-    summary.counts = dataclasses.replace(pairer.counts, unpaired=pairer.counts.unpaired + pairer.waiting)
-    if not summary.outcomes:
-        if summary.masked:
-            raise ToolError(f'--mask {mask_s:g}: no pair comes after the {summary.masked} that made the mask')
-        raise ToolError(f'no images pair: there are {summary.images["a"]} of plane A and {summary.images["b"]} of plane B, '
-                        f'{summary.counts.unstamped} without a stamp; sync_slop is {config.input.sync_slop * 1e3:g} ms')
-    return summary
-
-
-def _span_ns(bag, window: tuple[float, float]) -> tuple[int | None, int | None]:
-    """The log times from and before which to read; None: no limit."""
-    start, duration = window
-    start_ns = bag.start_ns + round(start * 1e9) if start else None
-    return start_ns, None if math.isinf(duration) else (start_ns or bag.start_ns) + round(duration * 1e9)
-
-
-def _copy(bag, out, images: dict[str, str], infos: dict[str, str], span: tuple[int | None, int | None]) -> None:
-    """Copy the images of the span, and all camera infos: an earlier one may hold."""
-    for topic in (*infos, *images):
+def copier(bag, out, topics: Topics):
+    """A function that copies messages of `bag` into `out` as they are; declares their topics."""
+    for topic in (*topics.infos, *topics.images):
         out.declare(topic, bag.types()[topic])
-    for topics, limits in ((infos, (None, None)), (images, span)):
-        for recorded in tqdm(bag.messages(topics, *limits), 'copying', unit='message', disable=None):
-            out.write(recorded.topic, recorded.message, stamp_ns(recorded.message))
+    return lambda recorded, stamp: out.write_raw(recorded.topic, recorded.raw, stamp)
 
 
-def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary) -> dict[str, list[tuple[int, Camera]]]:
-    """Plane to the valid cameras of the whole bag with their stamps, ascending; the others are noted in `summary`."""
-    known = {plane: [] for plane in PLANES}
-    for recorded in bag.messages(infos):
-        plane, entry = infos[recorded.topic], camera(recorded.message)
-        try:
-            if not known[plane] or known[plane][-1][1] != entry:
-                checked_camera(recorded.message, config, plane)
-            known[plane].append((stamp_ns(recorded.message), entry))
-        except BadCameraInfo as error:
-            summary.refused[plane] = str(error)
-    return {plane: sorted(entries, key=itemgetter(0)) for plane, entries in known.items()}
+class Results:
+    """The bag with the results (of create_bag): one diagnostics message a pair, and the shape where there is one."""
 
+    def __init__(self, out, names: dict[str, str]):
+        self._out = out
+        self._adapters = {names[name]: adapter for name, (_, adapter) in RESULTS.items()}
+        for name, (kind, _) in RESULTS.items():
+            out.declare(names[name], kind)
+        out.declare(DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray')
 
-def camera_at(known: list[tuple[int, Camera]], stamp: int) -> Camera | None:
-    """The newest camera stamped at or before an image; the oldest one for an image before them all."""
-    return known[max(bisect_right(known, stamp, key=itemgetter(0)) - 1, 0)][1] if known else None
+    def take(self, answer: Answer) -> None:
+        """Write the result of a pair."""
+        out, result, stamp = self._out, answer.result, answer.job.stamp_ns
+        level = ERROR if result.outcome in FAULTS else WARN if result.outcome is not Outcome.OK or result.warnings else OK
+        reason = ': '.join(filter(None, (result.outcome.value, result.detail)))
+        status = Status('reconstruction', level, '; '.join((reason, *result.warnings)),
+                        {'last outcome': result.outcome.value, 'last detail': result.detail, 'warnings': ', '.join(result.warnings)})
+        out.write(DIAGNOSTICS, diagnostic_array([status], stamp, NODE, out.new), stamp)
+        if result.shape is not None:
+            for topic, adapter in self._adapters.items():
+                out.write(topic, adapter(result.shape, stamp, answer.job.frame_id, out.new), stamp)
 
-
-def _pairs(stream, images: dict[str, str], pairer: Pairer, memory: Memory, summary: Summary) -> Iterator[tuple]:
-    """The pairs of a stream of recorded images: stamp of plane A in ns, message of plane A, of plane B."""
-    for recorded in stream:
-        plane, jumps = images[recorded.topic], pairer.counts.jumps
-        summary.images[plane] += 1
-        pair = pairer.add(plane, stamp_ns(recorded.message), recorded.message)
-        if pairer.counts.jumps > jumps:
-            memory.reset()
-        if pair is not None:
-            yield pair
-
-
-def take_mask(jobs: Iterator[Job], memory: Memory, views) -> int:
-    """Make the mean of pairs of messages the mask; how many these were. Bad ones are left out."""
-    memory.capture_mask(sys.maxsize)
-    for job in jobs:
-        frame = adapt(job, views, None, Tally())
-        if isinstance(frame, Frame):
-            memory.take_for_mask(frame, image_window(job, frame))
-    return memory.finish_mask()
-
-
-def answer(job: Job, memory: Memory, views) -> tuple[Frame | None, Reconstruction]:
-    """The frame of a pair of messages, None where they can't be one, and the answer."""
-    tally = Tally()
-    frame = adapt(job, views, None, tally)
-    if isinstance(frame, Reconstruction):
-        return None, frame
-    try:
-        result = reconstruct(frame, job.config, memory.prior(job, frame, image_window(job, frame), tally))
-    except Exception as error:  # the last line of defence: a pair must not take the other thousands with it; the tool ends with 1
-        return frame, Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
-    memory.remember(job, frame, result)
-    return frame, result
-
-
-def write_result(out, job: Job, result: Reconstruction) -> None:
-    """One diagnostics message a pair, and the shape where there is one."""
-    stamp = job.stamp_ns
-    level = ERROR if result.outcome in FAULTS else WARN if result.outcome is not Outcome.OK or result.warnings else OK
-    reason = ': '.join(filter(None, (result.outcome.value, result.detail)))
-    status = Status('reconstruction', level, '; '.join((reason, *result.warnings)),
-                    {'last outcome': result.outcome.value, 'last detail': result.detail, 'warnings': ', '.join(result.warnings)})
-    out.write('/diagnostics', diagnostic_array([status], stamp, NODE, out.new), stamp)
-    if result.shape is not None:
-        for topic, (_, adapter) in RESULTS.items():
-            out.write(topic, adapter(result.shape, stamp, job.frame_id, out.new), stamp)
+    def close(self) -> None:
+        """Nothing is left to do: the bag is closed by who made it."""
 
 
 def report(summary: Summary, out: str) -> str:

@@ -1,0 +1,123 @@
+"""What can still be read of a damaged bag: a recording that was cut off, lost its metadata.yaml, or has bad blocks in it.
+
+Every file is read from its begin to the first thing that makes no sense; a bad chunk (MCAP) or row (sqlite3) before that is stepped over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import zstandard
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+ROWS_TRIED = 256                    # damaged rows in sequence after which nothing more is to be expected
+RECORD_LIMIT = 2**30                # bytes; a length beyond it is damage, not data
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'    # no CDR message begins like this: compressed one by one
+
+_ROWS_AFTER = 'SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id'
+
+Raw = tuple[str, str, int, bytes]   # topic, type, log time in ns, CDR
+
+
+class Salvage:
+    """The readable messages of the files of a bag, in the order of the files. A context: compressed files are unpacked for its time."""
+
+    def __init__(self, path: Path):
+        self._files = storage_files(path)
+        self._stack = contextlib.ExitStack()
+        self.topics: dict[str, tuple[str, int]] = {}    # name -> type and number of readable messages
+        self._unpacked = [self._unpack(file) for file in self._files]
+        times = []
+        for topic, kind, log_ns, _ in self._all():
+            self.topics[topic] = kind, self.topics.get(topic, (kind, 0))[1] + 1
+            times.append(log_ns)
+        self.start_ns, self.end_ns = min(times, default=0), max(times, default=-1) + 1     # log time of the first, and just after the last
+
+    def close(self) -> None:
+        self._stack.close()
+
+    def messages(self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[Raw]:
+        """The messages on `topics` logged from `start_ns` to before `stop_ns`."""
+        return (m for m in self._all() if m[0] in topics and (start_ns is None or m[2] >= start_ns) and (stop_ns is None or m[2] < stop_ns))
+
+    def _all(self) -> Iterator[Raw]:
+        for path in self._unpacked:
+            for topic, kind, log_ns, raw in (mcap_messages if path.suffix == '.mcap' else sqlite_messages)(path):
+                if raw[:4] == ZSTD_MAGIC:
+                    try:
+                        raw = zstandard.ZstdDecompressor().decompress(raw)
+                    except zstandard.ZstdError:
+                        continue
+                yield topic, kind, log_ns, raw
+
+    def _unpack(self, path: Path) -> Path:
+        """The file itself, or what comes out of a compressed one until it makes no sense."""
+        if path.suffix != '.zstd':
+            return path
+        folder = self._stack.enter_context(tempfile.TemporaryDirectory())
+        out = Path(folder) / path.stem
+        with path.open('rb') as packed, out.open('wb') as unpacked, contextlib.suppress(zstandard.ZstdError):
+            shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), unpacked)
+        return out
+
+
+def storage_files(path: Path) -> list[Path]:
+    """The storage files of a bag in a folder, or the one file it is; sorted by name, as a recording splits them."""
+    names = ('*.mcap', '*.db3', '*.mcap.zstd', '*.db3.zstd')
+    return sorted(p for pattern in names for p in path.glob(pattern)) if path.is_dir() else [path]
+
+
+def mcap_messages(path: Path) -> Iterator[Raw]:
+    """The messages of an MCAP file in the order of the file."""
+    schemas, channels = {}, {}
+    for record in _mcap_records(path):
+        if isinstance(record, Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, Channel) and record.schema_id in schemas:
+            channels[record.id] = record.topic, schemas[record.schema_id]
+        elif isinstance(record, Message) and record.channel_id in channels:
+            yield *channels[record.channel_id], record.log_time, record.data
+
+
+def _mcap_records(path: Path) -> Iterator:
+    with path.open('rb') as file:
+        records = StreamReader(io.BufferedReader(file), emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        while True:
+            try:
+                record = next(records, None)
+            except Exception:       # mcap raises anything from struct.error to its own on bytes that are no record: this is where it ends
+                return
+            if record is None:
+                return
+            try:
+                parts = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+            except Exception:       # the same inside a chunk, but the next one stands by itself
+                continue
+            yield from parts
+
+
+def sqlite_messages(path: Path) -> Iterator[Raw]:
+    """The messages of a sqlite3 storage file in the order in which they were written."""
+    with contextlib.closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True, check_same_thread=False)) as database:
+        try:
+            database.execute('PRAGMA writable_schema=ON')   # reads on where the file is shorter than it says
+            topics = {number: (name, kind) for number, name, kind in database.execute('SELECT id, name, type FROM topics')}
+        except sqlite3.DatabaseError:
+            return
+        number, failures = -1, 0
+        while failures < ROWS_TRIED:
+            try:
+                for number, topic, log_ns, raw in database.execute(_ROWS_AFTER, (number,)):     # noqa: B007, B020
+                    failures = 0
+                    if topic in topics and isinstance(log_ns, int) and isinstance(raw, bytes):
+                        yield *topics[topic], log_ns, raw
+                return
+            except sqlite3.DatabaseError:
+                number, failures = number + 1, failures + 1

@@ -1,0 +1,287 @@
+"""DICOM XA runs, made here, into bags: geometry, times and pixels derived by hand, and nothing that tells whose images they are."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('rosbags')
+pytest.importorskip('mcap')
+pydicom = pytest.importorskip('pydicom', '3.0')
+
+from drawing import SIZE, curve                                             # noqa: E402
+from pydicom.dataset import Dataset, FileMetaDataset                        # noqa: E402
+from pydicom.encaps import encapsulate                                      # noqa: E402
+from pydicom.uid import ExplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless, generate_uid    # noqa: E402
+from scipy.spatial import cKDTree                                           # noqa: E402
+
+from fluoro_shape_ros.geometry import project, source                       # noqa: E402
+from fluoro_shape_ros.tools import dicom, dicom_pixels, importer, replay    # noqa: E402
+from msg_adapters.bags import open_bag                                      # noqa: E402
+from msg_adapters.images import image_to_array                              # noqa: E402
+from msg_adapters.messages import stamp_ns                                  # noqa: E402
+from msg_adapters.shapes import path_to_points                              # noqa: E402
+
+SID, SOD, PITCH = 1000.0, 750.0, 0.5        # mm
+WIDE = 4 / 3                                # mm, pitch of the detector on which the device is drawn
+PERSON = dict(PatientName='Secret^Somebody', PatientID='SECRET-0815', PatientBirthDate='19700102', InstitutionName='Secret Hospital',
+              StudyDate='20260102', OperatorsName='Secret^Operator', StudyDescription='SECRET', ContentTime='121314')
+MIDDLE = (SIZE - 1) / 2
+
+
+def make(path, frames, primary=0.0, syntax=ExplicitVRLittleEndian, pixel_data=None, **attributes):
+    """An XA file of (N, H, W) uint8 or uint16 frames; an attribute of None is left out."""
+    frames = np.asarray(frames)
+    bits = 8 * frames.itemsize
+    meta = FileMetaDataset()
+    meta.TransferSyntaxUID, meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = syntax, '1.2.840.10008.5.1.4.1.1.12.1', generate_uid()
+    header = Dataset()
+    header.file_meta = meta
+    given = dict(SOPClassUID=meta.MediaStorageSOPClassUID, SOPInstanceUID=meta.MediaStorageSOPInstanceUID, Modality='XA', Rows=frames.shape[1],
+                 Columns=frames.shape[2], NumberOfFrames=len(frames), SamplesPerPixel=1, PhotometricInterpretation='MONOCHROME2', BitsAllocated=bits,
+                 BitsStored=bits, HighBit=bits - 1, PixelRepresentation=0, PixelIntensityRelationship='LIN', DistanceSourceToDetector=SID,
+                 DistanceSourceToPatient=SOD, ImagerPixelSpacing=[PITCH, PITCH], PositionerPrimaryAngle=primary, PositionerSecondaryAngle=0.0, FrameTime=100.0)
+    for keyword, value in (PERSON | given | attributes).items():
+        if value is not None:
+            setattr(header, keyword, value)
+    header.PixelData = pixel_data or frames.tobytes()
+    header['PixelData'].VR = 'OB' if bits == 8 or pixel_data else 'OW'
+    header.save_as(path, enforce_file_format=True)
+    return path
+
+
+def seen(angle):
+    """(SIZE, SIZE) uint8: the drawn device at primary angle 0 or 90, as the files show it; projected by hand."""
+    x, y, z = 1e3 * curve().T
+    depth, across = (SOD - y, x) if angle == 0 else (SOD + x, y)       # the source behind the patient, or at the right
+    uv = np.c_[MIDDLE + SID / WIDE * across / depth, MIDDLE - SID / WIDE * z / depth]
+    image = np.full((SIZE, SIZE), 180, np.uint8)
+    cv2.polylines(image, [np.round(uv * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
+    return cv2.GaussianBlur(image, (5, 5), 0)
+
+
+BLANK = np.full((2, 8, 9), 7, np.uint16)
+PAIR = [np.stack([seen(angle)] * 2) for angle in (0, 90)]
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """a.dcm and b.dcm in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    make('a.dcm', PAIR[0], ImageType=['ORIGINAL', 'PRIMARY', 'BIPLANE A'], ImagerPixelSpacing=[WIDE, WIDE])
+    make('b.dcm', PAIR[1], 90.0, ImageType=['ORIGINAL', 'PRIMARY', 'BIPLANE B'], ImagerPixelSpacing=[WIDE, WIDE])
+    return tmp_path
+
+
+def read(path='out'):
+    with open_bag(path) as bag:
+        return {topic: [r.message for r in bag.messages([topic])] for topic in bag.types()}
+
+
+def refused(capsys, *files):
+    assert importer.main(['--dicom', *map(str, files), '--out', 'out']) == 1
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and 'ecret' not in error
+    return error
+
+
+# ---- geometry and time
+
+
+def P_of(path):
+    return dicom.read_run(path).calibrations[0].P
+
+
+def test_projection_at_zero_and_from_the_left(tmp_path):
+    """A point 10 mm off the isocentre is 10 * 1000 / 750 / 0.5 px off the middle; head is up, the patient's left at the right."""
+    front, left = (P_of(make(tmp_path / 'run.dcm', BLANK, angle)) for angle in (0, 90))
+    middle, step = np.array([4.0, 3.5]), 10 / 750 * 1000 / 0.5
+    assert np.allclose(project(front, np.zeros(3)), middle) and np.allclose(project(left, np.zeros(3)), middle)
+    assert np.allclose(project(front, np.array([0.01, 0, 0])) - middle, [step, 0])
+    assert np.allclose(project(front, np.array([0, 0, 0.01])) - middle, [0, -step])
+    assert np.allclose(project(left, np.array([0, 0.01, 0])) - middle, [step, 0])       # the spine is at the right of LAO views
+    assert np.allclose(source(front), [0, 0.75, 0]) and np.allclose(source(left), [-0.75, 0, 0])
+
+
+def test_cranial_angles_put_the_source_below_and_pixels_need_not_be_square(tmp_path):
+    P = P_of(make(tmp_path / 'run.dcm', BLANK, PositionerSecondaryAngle=30.0, ImagerPixelSpacing=[0.25, 0.5]))
+    assert np.allclose(source(P), [0, 0.75 * np.cos(np.pi / 6), -0.375])
+    assert project(P, np.array([0.0, 0, 0.01]))[1] < 3.5
+    across = project(P, np.array([0.01, 0, 0])) - [4, 3.5]
+    assert np.allclose(across, [10 / 750 * 1000 / 0.5, 0])
+    K = dicom.read_run(tmp_path / 'run.dcm').calibrations[0].K
+    assert K[1, 1] == 4000 and K[0, 0] == -2000      # rows come first in ImagerPixelSpacing
+
+
+def test_the_patients_orientation_decides_against_the_usual_display(tmp_path):
+    P = P_of(make(tmp_path / 'run.dcm', BLANK, PatientOrientation=['R', 'F']))
+    assert project(P, np.array([0.01, 0, 0]))[0] < 4 and project(P, np.array([0, 0, 0.01]))[1] < 3.5
+    assert np.allclose(P_of(make(tmp_path / 'run.dcm', BLANK, PatientOrientation=['L', 'F'])), P_of(make(tmp_path / 'run.dcm', BLANK)))
+
+
+def test_a_moving_run_has_a_camera_a_frame(tmp_path):
+    moving = dicom.read_run(make(tmp_path / 'run.dcm', np.repeat(BLANK, 2, axis=0), 10.0, PositionerPrimaryAngleIncrement=[0, 5, 10, 10]))
+    at = [P_of(make(tmp_path / 'still.dcm', BLANK, angle)) for angle in (10, 15, 20, 20)]
+    assert all(np.allclose(c.P, P) for c, P in zip(moving.calibrations, at, strict=True))
+    assert moving.calibrations[3] is moving.calibrations[2] is not moving.calibrations[1]
+
+
+@pytest.mark.parametrize('attributes, milliseconds', [
+    (dict(FrameTime=33.333), [0, 33.333]),
+    (dict(FrameTime=None, FrameTimeVector=[0, 66.7]), [0, 66.7]),
+    (dict(FrameTimeVector=[0, 66.7], FrameIncrementPointer=0x00181065), [0, 66.7]),
+    (dict(FrameTimeVector=[0, 66.7], FrameIncrementPointer=0x00181063), [0, 100]),
+    (dict(FrameTime=None, CineRate=8), [0, 125]),
+    (dict(FrameTime=None, RecommendedDisplayFrameRate=20), [0, 50]),
+    (dict(FrameTime=None), None),
+])
+def test_times_of_the_frames(tmp_path, attributes, milliseconds):
+    times = dicom.read_run(make(tmp_path / 'run.dcm', BLANK, **attributes)).times_ns
+    assert times is milliseconds is None or np.allclose(times, np.array(milliseconds) * 1e6)
+
+
+# ---- pixels
+
+
+@pytest.mark.parametrize('raw, attributes, value', [
+    (0x0abc, dict(BitsStored=12, HighBit=11), 0xabc),
+    (0xfabc, dict(BitsStored=12, HighBit=11), 0xabc),       # something else in the unused bits
+    (0xabcf, dict(BitsStored=12, HighBit=15), 0xabc),
+    (0xffff, {}, 0xffff),
+    (0xfffe, dict(PixelRepresentation=1), 0x7ffe),          # -2, with -32768 raised to 0
+    (0x0801, dict(BitsStored=12, HighBit=11, PixelRepresentation=1), 1),
+    (0x0001, dict(BitsStored=12, HighBit=11, PhotometricInterpretation='MONOCHROME1'), 0xffe),
+    (0x0123, dict(WindowCenter=5, WindowWidth=3), 0x123),   # is for displays
+    (0x0123, dict(PixelIntensityRelationship='LOG'), 0x123),
+])
+def test_pixels_as_stored(tmp_path, raw, attributes, value):
+    run = dicom.read_run(make(tmp_path / 'run.dcm', np.full((2, 3, 4), raw, np.uint16), **attributes))
+    frames = list(dicom_pixels.pictures(run))
+    assert len(frames) == 2 and all(f.dtype == np.uint16 and f.shape == (3, 4) and (f == value).all() for f in frames)
+
+
+def test_logarithms_become_intensities_by_the_files_own_table(tmp_path):
+    table = Dataset()
+    table.LUTDescriptor, table.ModalityLUTType, table.LUTData = [256, 0, 16], 'US', [k * k for k in range(256)]
+    table['LUTData'].VR = 'US'
+    run = dicom.read_run(make(tmp_path / 'run.dcm', np.full((1, 3, 4), 200, np.uint8), PixelIntensityRelationship='LOG', ModalityLUTSequence=[table]))
+    assert [frame.tolist() for frame in dicom_pixels.pictures(run)] == [[[40000] * 4] * 3]
+
+
+def test_compressed_frames(tmp_path):
+    """RLE, which pydicom decodes by itself, and JPEG."""
+    path = make(tmp_path / 'run.dcm', PAIR[0])
+    header = pydicom.dcmread(path)
+    header.compress(RLELossless)
+    header.save_as(tmp_path / 'rle.dcm')
+    assert all(np.array_equal(f, PAIR[0][0]) for f in dicom_pixels.pictures(dicom.read_run(tmp_path / 'rle.dcm')))
+    jpeg = cv2.imencode('.jpg', PAIR[0][0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    make(path, PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([jpeg, jpeg]))
+    try:
+        frames = list(dicom_pixels.pictures(dicom.read_run(path)))
+    except dicom.BadDicom as error:
+        if 'needs one of' in str(error):
+            pytest.skip('no plug-in for JPEG')
+        raise
+    assert len(frames) == 2 and np.abs(frames[1].astype(int) - PAIR[0][0]).max() < 20
+    assert dicom_pixels.codestream_size(jpeg) == (SIZE, SIZE)
+
+
+# ---- through the command line
+
+
+def test_imported_runs_replay_to_the_device(files, capsys):
+    assert importer.main(['--dicom', 'b.dcm', 'a.dcm', '--out', 'out']) == 0      # the files say which is which
+    assert '2 pairs in out' in capsys.readouterr().out
+    bag = read()
+    assert [stamp_ns(m) for m in bag['/plane_a/image_raw']] == [10**9, 1_100_000_000] == [stamp_ns(m) for m in bag['/plane_b/camera_info']]
+    assert np.array_equal(image_to_array(bag['/plane_a/image_raw'][0]), PAIR[0][0])
+    base = 'base_position=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])
+    assert replay.main(['out', '--out', 'results', '-p', 'robot_radius=0.001', '-p', base, '-p', 'reference_frame=isocentre']) == 0
+    paths = read('results')['/backbone']
+    assert len(paths) == 2 and paths[0].header.frame_id == 'isocentre'
+    assert cKDTree(curve()).query(path_to_points(paths[0]))[0].max() < 0.004
+
+
+def test_a_moving_run_sends_camera_infos_anew(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make('a.dcm', BLANK, PositionerPrimaryAngleIncrement=[0, 5])
+    make('b.dcm', BLANK, 90.0)
+    assert importer.main(['--dicom', 'a.dcm', 'b.dcm', '--out', 'out', '--rate', '5']) == 0
+    first, second = read()['/plane_a/camera_info']
+    assert not np.array_equal(first.p, second.p) and (stamp_ns(first), stamp_ns(second)) == (10**9, 1_200_000_000)
+
+
+def test_nothing_tells_whose_images_they_are(files):
+    done = subprocess.run([sys.executable, '-c', f'import sys\nsys.path[:0] = {[p for p in sys.path if p]!r}\nfrom fluoro_shape_ros.tools.importer import main\n'
+                           'sys.exit(main())', '--dicom', 'a.dcm', 'b.dcm', '--out', 'out'], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    written = b''.join(p.read_bytes() for p in (files / 'out').iterdir()) + (done.stdout + done.stderr).encode()
+    for word in map(str.encode, PERSON.values()):
+        assert word in (files / 'a.dcm').read_bytes() and word not in written, word
+
+
+@pytest.mark.parametrize('attributes, says', [
+    (dict(Rows=8000, Columns=8000, NumberOfFrames=1000), 'truncated: 1000 frames of 8000x8000 px need 128000000000 bytes, the file has'),
+    (dict(Rows=60000), 'Rows must be one number in [1, 8192]'),
+    (dict(DistanceSourceToDetector=None), 'DistanceSourceToDetector is missing'),
+    (dict(DistanceSourceToPatient=1200.0), 'is not in front of the detector'),
+    (dict(ImagerPixelSpacing=None), 'ImagerPixelSpacing must be two distances'),
+    (dict(PositionerPrimaryAngle=None), 'PositionerPrimaryAngle is missing'),
+    (dict(PositionerPrimaryAngleIncrement=[0, 1, 2]), 'PositionerPrimaryAngleIncrement has 3 values for 2 frames'),
+    (dict(FrameTimeVector=[0, -1]), 'FrameTimeVector'),
+    (dict(PhotometricInterpretation='RGB', SamplesPerPixel=3), 'only grey pixels of 8 or 16 bits are read, not RGB'),
+    (dict(SOPClassUID='1.2.840.10008.5.1.4.1.1.12.1.1'), 'an Enhanced XA image'),
+    (dict(syntax=pydicom.uid.MPEG2MPML, pixel_data=encapsulate([b'12345678'] * 2)), 'compressed as MPEG2'),
+    (dict(syntax=RLELossless, pixel_data=encapsulate([b'12345678'] * 2)), 'frame 1 can\'t be decoded'),
+    (dict(ImageType=['ORIGINAL', 'PRIMARY', 'BIPLANE B']), 'both are of plane B'),
+])
+def test_what_can_not_work_is_said_in_one_line(files, capsys, attributes, says):
+    make('a.dcm', BLANK, **attributes)
+    assert says in refused(capsys, 'a.dcm', 'b.dcm')
+    assert not (files / 'out').exists()
+
+
+def test_files_that_are_none(files, capsys):
+    whole = (files / 'a.dcm').read_bytes()
+    (files / 'text.dcm').write_text('not DICOM')
+    (files / 'cut.dcm').write_bytes(whole[:-1000])
+    (files / 'head.dcm').write_bytes(whole[:400])
+    assert 'text.dcm: not a DICOM file' in refused(capsys, 'text.dcm', 'b.dcm')
+    assert 'cut.dcm: truncated: 2 frames of 320x320 px need' in refused(capsys, 'cut.dcm', 'b.dcm')
+    assert 'head.dcm: ' in refused(capsys, 'head.dcm', 'b.dcm')
+    assert 'none.dcm' in refused(capsys, 'none.dcm', 'b.dcm')
+    assert 'coincide' in refused(capsys, 'a.dcm', make('again.dcm', PAIR[0], ImagerPixelSpacing=[WIDE, WIDE]))
+
+
+def test_a_compressed_frame_larger_than_it_says_is_refused_unopened(files, capsys):
+    jpeg = bytearray(cv2.imencode('.jpg', PAIR[0][0])[1].tobytes())
+    at = jpeg.index(b'\xff\xc0') + 5
+    jpeg[at:at + 4] = b'\xff\xf0\xff\xf0'
+    make('a.dcm', PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([bytes(jpeg)] * 2))
+    said = refused(capsys, 'a.dcm', 'b.dcm')
+    assert 'frame 1 is 65520x65520 px inside, but 320x320 by the header' in said or 'needs one of' in said
+
+
+def test_garbage_never_ends_in_another_error(tmp_path):
+    data, rng, named = make(tmp_path / 'run.dcm', BLANK).read_bytes(), np.random.default_rng(3), 0
+    for _ in range(80):
+        broken = bytearray(data)
+        start = rng.integers(132, len(data) - 8)
+        broken[start:start + 8] = rng.bytes(8)
+        (tmp_path / 'run.dcm').write_bytes(broken)
+        try:
+            list(dicom_pixels.pictures(dicom.read_run(tmp_path / 'run.dcm')))
+        except dicom.BadDicom as error:
+            named += 1
+            assert 'ecret' not in str(error) and '\n' not in str(error)
+    assert named
+
+
+@pytest.mark.parametrize('given', [['--dicom', 'a', 'b', '--plane-a', 'c'], ['--dicom', 'a'], ['--plane-a', 'a']])
+def test_either_files_or_dicom(given, capsys):
+    with pytest.raises(SystemExit) as end:
+        importer.main([*given, '--out', 'out'])
+    assert end.value.code == 2 and 'dicom' in capsys.readouterr().err
