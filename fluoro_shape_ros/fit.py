@@ -60,17 +60,20 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
     """
     scale = [pixels_per_metre(v.P, points) for v in views]
     half_width = [radius * k for k in scale]
-    step, length = 1 / max(scale), arc_length(points)[-1]
-    if max(half_width) > MAX_HALF_WIDTH_PX or length > sum(v.width + v.height for v in views) * step or min(depth(v.P, points).min() for v in views) <= 0:
-        return None     # no start: it goes to a source, or out of the images and back
+    step = 1 / max(scale)
+    longest = step * sum(v.width + v.height for v in views)
+    if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
+        return None     # it goes to a source
     reach = half_width_range(max(half_width))
     template = _shadows(half_width, np.arange(-reach, reach + 1))
     spline = through(points, EXTENSION_PX * step)
-    reference = (0.0, length)
+    reference = (0.0, arc_length(points)[-1])
     grown, length_px = 0, 0.0
     rounds = [True] * coarse + [False] * FINE
     while rounds:
         wide = rounds.pop(0)
+        if not spline.stop - spline.start < longest:
+            return None     # it has left the images, or turns back and forth in them
         s = np.arange(spline.start, spline.stop, COARSE_STEP * step if wide else step)
         strips = cut(images, fields, views, spline(s), spline(s, 1), reach + WIDE_PX if wide else reach)
         within = (s >= reference[0]) & (s <= reference[1])
