@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .centerline import Candidate, find_candidates, find_ridges, ridge_scale, shrinking
+from .centerline import find_ridges, ridge_scale, shrinking
+from .chains import Candidate, find_candidates
 from .data import Outcome
 from .fit import Fit, continues, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
