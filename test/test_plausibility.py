@@ -99,6 +99,7 @@ def test_a_clear_device_raises_no_doubt():
     (dict(presence=hidden(0.01, 0.05, 0)), Outcome.POORLY_EXPLAINED, 'plane a'),
     (dict(beyond=np.array([[0.9, 0.0], [0.0, 0.0]])), Outcome.DIRECTIONS_DISAGREE, 'first end'),
     (dict(beyond=np.array([[0.0, 0.0], [0.0, 0.9]])), Outcome.DIRECTIONS_DISAGREE, 'last end'),
+    (dict(beyond=np.array([[0.0, 0.0], [-0.4, -0.3]])), Outcome.POORLY_EXPLAINED, 'last end'),
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
 ])
 def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
