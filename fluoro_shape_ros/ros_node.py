@@ -25,13 +25,13 @@ from . import params
 from .config import ConfigError
 from .data import Frame, Outcome, Reconstruction
 from .outputs import Outputs
-from .pairing import PLANES, CameraBook, Pairer
+from .pairing import PLANES, Pairer
 from .pipeline import reconstruct
 from .subscriptions import AdaptiveSubscription, transform_lookup
+from .waiting import CameraBook, Pair, WaitingRoom
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
-PATIENCE_S = 0.2        # for a camera info that should come with its image
 
 
 class FluoroShapeNode(Node):
@@ -43,7 +43,7 @@ class FluoroShapeNode(Node):
     def __init__(self):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
-        self._enabled, self._prediction, self._held, self._levels = True, None, None, None
+        self._enabled, self._prediction, self._levels, self._room = True, None, None, WaitingRoom()
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
@@ -109,8 +109,8 @@ class FluoroShapeNode(Node):
                 book.rewind(stamp)
         if pair is not None:
             self._tally.event('pair')
-            self._drop(self._held is not None)
-            self._held = *pair, arrived
+            stamp_a, image_a, image_b = pair
+            self._drop(self._room.add(Pair((stamp_a, stamp_ns(image_b)), (image_a, image_b), arrived)))
             self._hand_over()
         self._report_changes()
 
@@ -122,8 +122,11 @@ class FluoroShapeNode(Node):
         except BadCameraInfo as error:
             self._tally.refused(f'camera info {plane}', str(error))
             self._report_changes()
-            return
-        self._tally.accepted(f'camera info {plane}')
+            if book.newest is None:
+                return
+            known = book.newest     # the one before holds, and no image need wait for this one
+        else:
+            self._tally.accepted(f'camera info {plane}')
         book.add(stamp_ns(msg), known)
         self._hand_over()
 
@@ -137,28 +140,20 @@ class FluoroShapeNode(Node):
         self._report_changes()
 
     def _hand_over(self) -> None:
-        """Give the pair that is held to the worker, as soon as its cameras are known."""
-        if self._held is None:
-            return
-        stamp_a, image_a, image_b, arrived = self._held
-        stamps = stamp_a, stamp_ns(image_b)
-        waits = [self._books[plane].awaits(stamp) for plane, stamp in zip(PLANES, stamps)]
-        if any(waits) and time.monotonic() < arrived + PATIENCE_S:
-            return
-        for plane, late in zip(PLANES, waits):
-            if late:
-                self._books[plane].give_up()
-        self._held = None
-        cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, stamps))
-        self._drop(self._worker.offer(Job(stamp_a, (image_a, image_b), cameras, self._config, self._memory.generation, arrived, self._prediction)))
+        """Give the newest pair whose cameras are known to the worker."""
+        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic())
+        if pair is not None:
+            cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
+            lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, self._prediction))
+        self._drop(lost)
 
-    def _drop(self, dropped: bool) -> None:
-        if dropped:
+    def _drop(self, pairs: int) -> None:
+        for _ in range(pairs):
             self._tally.event('dropped')
 
     def _forget(self) -> None:
         """Nothing of what came before counts any more, but the cameras and the mask."""
-        self._held = None
+        self._room.clear()
         self._worker.clear()
         self._memory.reset()
 
