@@ -25,7 +25,7 @@ EXTRAS = {
 }
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
-EXTRAS['test'] = [*EXTRAS['all'], 'pytest>=7.4']
+EXTRAS['test'] = [*EXTRAS['all'], 'pytest>=7.4', 'hypothesis>=6.98']
 
 setup(
     name=NAME,

@@ -115,8 +115,9 @@ class FluoroShapeNode(Node):
         self._report_changes()
 
     def _on_camera_info(self, plane: str, msg) -> None:
-        book, known = self._books[plane], camera(msg)
+        book = self._books[plane]
         try:
+            known = camera(msg)
             if known != book.newest:
                 known = checked_camera(msg, self._config, plane)
         except BadCameraInfo as error:

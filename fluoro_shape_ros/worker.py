@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
+from msg_adapters.cameras import BadCameraInfo, camera_info_to_view, check_lengths
 from msg_adapters.diagnostics import Tally
 from msg_adapters.images import BadImage, compressed_to_array, image_to_array
 
@@ -36,6 +36,8 @@ class Camera:
 
 
 def camera(msg) -> Camera:
+    """The camera of a sensor_msgs/CameraInfo, unchecked but for its lengths. Raises BadCameraInfo where these are absurd."""
+    check_lengths(msg)
     content = (msg.header.frame_id, msg.height, msg.width, msg.distortion_model, *map(tuple, (msg.d, msg.k, msg.r, msg.p)))
     roi = msg.roi
     return Camera((*content, msg.binning_x, msg.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height), msg)

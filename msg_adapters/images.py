@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .messages import New, header
+from .messages import New, header, short
 
 
 class BadImage(ValueError):
@@ -46,7 +46,7 @@ def image_to_array(msg) -> np.ndarray:
     Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, and values that are not finite.
     """
     if msg.encoding not in ENCODINGS:
-        raise BadImage(f'encoding "{msg.encoding}" is not one of {", ".join(ENCODINGS)}')
+        raise BadImage(f'encoding "{short(msg.encoding)}" is not one of {", ".join(ENCODINGS)}')
     encoding = ENCODINGS[msg.encoding]
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
     if height == 0 or width == 0:
@@ -90,9 +90,9 @@ def compressed_to_array(msg) -> np.ndarray:
     try:
         array = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise BadImage(f'the compressed image ("{msg.format}") can\'t be decoded: {error.err}') from error
+        raise BadImage(f'the compressed image ("{short(msg.format)}") can\'t be decoded: {error.err}') from error
     if array is None:
-        raise BadImage(f'the compressed image ("{msg.format}", {len(msg.data)} bytes) can\'t be decoded')
+        raise BadImage(f'the compressed image ("{short(msg.format)}", {len(msg.data)} bytes) can\'t be decoded')
     return grey(array)
 
 

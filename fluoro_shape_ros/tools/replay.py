@@ -194,8 +194,9 @@ def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary) -
     """Plane to the valid cameras of the whole bag with their stamps, ascending; the others are noted in `summary`."""
     known = {plane: [] for plane in PLANES}
     for recorded in bag.messages(infos):
-        plane, entry = infos[recorded.topic], camera(recorded.message)
+        plane = infos[recorded.topic]
         try:
+            entry = camera(recorded.message)
             if not known[plane] or known[plane][-1][1] != entry:
                 checked_camera(recorded.message, config, plane)
             known[plane].append((stamp_ns(recorded.message), entry))
