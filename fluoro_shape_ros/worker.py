@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -14,6 +15,7 @@ from msg_adapters.images import BadImage, compressed_to_array, image_to_array
 
 from .config import Config
 from .data import Frame, Outcome, Prior, Reconstruction, Shape, View
+from .limits import Oversized, check_pixels
 from .pairing import PLANES
 
 
@@ -90,7 +92,11 @@ def view_of(camera: Camera, plane: str, image_shape: tuple[int, int], rectified:
 
 def decode(msg) -> np.ndarray:
     """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage. Raises BadImage."""
-    return image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg)
+    if isinstance(msg, Oversized):
+        raise BadImage(msg.reason)
+    image = image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg)
+    check_pixels(*image.shape)
+    return image
 
 
 def adapt(job: Job, view_of: ViewOf, lookup: Lookup, tally: Tally) -> Frame | Reconstruction:
@@ -226,7 +232,7 @@ class Worker:
     def __init__(self, work: Callable[[Job], None], failed: Callable[[Job, Exception], None]):
         self._work, self._failed = work, failed
         self._changed = threading.Condition()
-        self._job, self._stopped = None, False
+        self._job, self._stopped, self._began = None, False, None
         self._thread = threading.Thread(target=self._run, name='reconstruction', daemon=True)
         self._thread.start()
 
@@ -241,6 +247,12 @@ class Worker:
         """Forget the job that waits, if any."""
         with self._changed:
             self._job = None
+
+    @property
+    def busy_s(self) -> float:
+        """How long the job at work has taken so far; 0 where there is none."""
+        began = self._began
+        return 0.0 if began is None else time.monotonic() - began
 
     def stop(self, timeout_s: float) -> bool:
         """Take no more jobs and wait for the one at work; whether it ended in time."""
@@ -257,7 +269,9 @@ class Worker:
                 if self._stopped:
                     return
                 job, self._job = self._job, None
+            self._began = time.monotonic()
             try:
                 self._work(job)
             except Exception as error:  # the last line of defence: a pair must not take the node with it
                 self._failed(job, error)
+            self._began = None

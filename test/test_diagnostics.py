@@ -32,6 +32,7 @@ def tally(clock):
     (PlaneSummary('a', silent_s=0.1, has_camera=True, rate_hz=15.0), OK, '15.0 images/s'),
     (PlaneSummary('a', silent_s=0.1), ERROR, 'no camera info yet'),
     (PlaneSummary('a', silent_s=9.0, has_camera=True), STALE, 'no image for 9 s'),
+    (PlaneSummary('a', silent_s=0.1, has_camera=True, publishers=2), WARN, '2 publishers'),
     (PlaneSummary('a', silent_s=0.1, has_camera=True, fell_back=True), WARN, 'best-effort'),
     (PlaneSummary('a', silent_s=9.0, image_fault='too short'), ERROR, 'bad image: too short'),
     (PlaneSummary('a', silent_s=0.1, camera_fault='K is zero'), ERROR, 'camera info refused: K is zero'),
@@ -58,6 +59,8 @@ def test_pairing(summary, level, words):
 @pytest.mark.parametrize('summary, level, words', [
     (ReconstructionSummary(), STALE, 'no pair yet'),
     (ReconstructionSummary(enabled=False), WARN, 'paused'),
+    (ReconstructionSummary(outcome=Outcome.OK, silent_s=9.0, overdue_s=8.6), ERROR, 'takes 9 s already'),
+    (ReconstructionSummary(outcome=Outcome.OK, silent_s=9.0, notes=('no /clock',)), STALE, 'no /clock'),
     (ReconstructionSummary(capturing=True, mask='capturing, 3 of 8 pairs'), OK, '3 of 8'),
     (ReconstructionSummary(outcome=Outcome.OK, detail='ok', silent_s=0.1, rate_hz=4.0), OK, '4.0 results/s'),
     (ReconstructionSummary(outcome=Outcome.OK, silent_s=0.1, warnings=('tip_ambiguous',)), WARN, 'tip_ambiguous'),
