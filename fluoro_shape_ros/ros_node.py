@@ -260,8 +260,18 @@ class FluoroShapeNode(Node):
         still = 'use_sim_time is set, but there is no /clock' if clock.ros_time_is_active and not clock.now().nanoseconds else ''
         notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still)))
         results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes,
-                                             overdue_s=max(self._worker.busy_s - OVERDUE_S, 0.0) and self._worker.busy_s)
+                                             overdue_s=self._overdue_s())
         return [*map(plane_status, planes), pairing_status(pairing), reconstruction_status(results)]
+
+    def _overdue_s(self) -> float:
+        """For how long the pair at work has been if that is too long, else 0; every such pair is counted once."""
+        busy = self._worker.busy_s
+        late = busy > OVERDUE_S
+        if late and not self._overdue:
+            self.get_logger().error(f'the pair at work takes more than {OVERDUE_S:g} s')
+            self._tally.event('overdue')
+        self._overdue = late
+        return busy if late else 0.0
 
     def _report(self, statuses) -> None:
         self._levels = _key(statuses)
@@ -274,11 +284,6 @@ class FluoroShapeNode(Node):
 
     def _on_second(self) -> None:
         self._senders = {plane: self._inputs[f'image {plane}'].publishers for plane in PLANES}
-        overdue = self._worker.busy_s > OVERDUE_S
-        if overdue and not self._overdue:
-            self.get_logger().error(f'the pair at work takes more than {OVERDUE_S:g} s')
-            self._tally.event('overdue')
-        self._overdue = overdue
         self._hand_over()
         self._report(self._statuses())
 
