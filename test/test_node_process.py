@@ -80,11 +80,11 @@ def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log
             return real(*arguments)
         def buggy(msg):
             return [][left.pop()] if left else bounded(msg)
-        def status(s, real=ros_node.reconstruction_status):
-            if s.overdue_s:
+        def told_of(statuses, *rest, make=ros_node.diagnostic_array):
+            if any('takes' in s.message for s in statuses):
                 told.set()
-            return real(s)
-        ros_node.reconstruct, ros_node.bounded, ros_node.reconstruction_status = long, buggy, status
+            return make(statuses, *rest)
+        ros_node.reconstruct, ros_node.bounded, ros_node.diagnostic_array = long, buggy, told_of
         sys.exit(main())"""
     with NodeProcess(log, BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected()
