@@ -15,7 +15,7 @@ from msg_adapters.images import BadImage, compressed_to_array, image_to_array
 
 from .config import Config
 from .data import Frame, Outcome, Prior, Reconstruction, Shape, View
-from .limits import Oversized, check_pixels
+from .limits import Oversized, check_pixels, check_png
 from .pairing import PLANES
 
 
@@ -94,6 +94,8 @@ def decode(msg) -> np.ndarray:
     """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage. Raises BadImage."""
     if isinstance(msg, Oversized):
         raise BadImage(msg.reason)
+    if not hasattr(msg, 'encoding'):
+        check_png(msg.data)
     image = image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg)
     check_pixels(*image.shape)
     return image
