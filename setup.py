@@ -27,7 +27,9 @@ EXTRAS = {
 }
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
-EXTRAS['test'] = [*EXTRAS['all'], 'pytest>=7.4']
+# atheris has wheels for these only, and its sources need clang
+EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags']]
+EXTRAS['test'] = [*EXTRAS['all'], *EXTRAS['fuzz'], 'pytest>=7.4', 'hypothesis>=6.98']
 
 setup(
     name=NAME,

@@ -122,6 +122,7 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
     Starts at the linear solution (HZ 12.2) and takes Newton steps on the reprojection error (Gauss-Newton Hessian),
     all points at once. NaN where a point can't be triangulated.
     """
+    a_px, b_px = (np.where(np.abs(px) < 1e9, px, np.nan) for px in (a_px, b_px))    # farther away nothing can be told, and squares overflow
     A = np.stack([a_px[:, 0, None] * Pa[2] - Pa[0], a_px[:, 1, None] * Pa[2] - Pa[1],
                   b_px[:, 0, None] * Pb[2] - Pb[0], b_px[:, 1, None] * Pb[2] - Pb[1]], axis=1)
     bad = ~np.isfinite(A).all(axis=(1, 2))
@@ -129,7 +130,7 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         H = np.einsum('nij,nik->njk', A[:, :, :3], A[:, :, :3])
         g = np.einsum('nij,ni->nj', A[:, :, :3], A[:, :, 3])
-        bad |= np.abs(np.linalg.det(H / (np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-300))) < 1e-15
+        bad |= _singular(H)
         H[bad] = np.eye(3)
         X = -np.linalg.solve(H, g[..., None])[..., 0]
         for _ in range(iterations):
@@ -137,14 +138,18 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
             J = np.concatenate([projection_jacobian(Pa, X), projection_jacobian(Pb, X)], axis=1)
             H = np.einsum('nij,nik->njk', J, J)
             g = np.einsum('nij,ni->nj', J, r)
-            wild = ~np.isfinite(H).all(axis=(1, 2)) | ~np.isfinite(g).all(axis=1)
-            bad |= wild
+            bad |= _singular(H) | ~np.isfinite(g).all(axis=1)
             H[bad], g[bad] = np.eye(3), 0.0
             step = np.linalg.solve(H, g[..., None])[..., 0]
             X = X - step
             if np.abs(step).max(initial=0.0) < 1e-9:
                 break
     return np.where(bad[:, None], np.nan, X)
+
+
+def _singular(H: np.ndarray) -> np.ndarray:
+    """(N,) whether (N, 3, 3) positive semidefinite matrices have no inverse worth the name, or are not finite."""
+    return ~(np.linalg.det(H / (np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-300)) >= 1e-15)
 
 
 def undistort(view: View, points_px: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
@@ -145,13 +145,14 @@ class NodeProcess:
 class Client:
     """Publishes pairs and hears the answers; a context of its own."""
 
-    def __init__(self, reliability=ReliabilityPolicy.RELIABLE, compressed=False, start_ns=10**12, domain=DOMAIN):
+    def __init__(self, reliability=ReliabilityPolicy.RELIABLE, compressed=False, start_ns=10**12, domain=DOMAIN,
+                 durability=DurabilityPolicy.VOLATILE):
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node('client', enable_rosout=False, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        qos = QoSProfile(depth=10, reliability=reliability)
+        qos = QoSProfile(depth=10, reliability=reliability, durability=durability)
         kind, topic, self._message = (CompressedImage, 'image_raw/compressed', png_msg) if compressed else (Image, 'image_raw', image_msg)
         self.images = [self.node.create_publisher(kind, f'plane_{p}/{topic}', qos) for p in 'ab']
         self.infos = [self.node.create_publisher(CameraInfo, f'plane_{p}/camera_info', qos) for p in 'ab']

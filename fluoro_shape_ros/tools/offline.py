@@ -210,10 +210,11 @@ def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary, c
     """Plane to the valid cameras of the whole bag with their stamps, ascending; the others are noted in `summary`."""
     known = {plane: [] for plane in PLANES}
     for recorded in bag.messages(infos):
-        plane, entry, stamp = infos[recorded.topic], camera(recorded.message), stamp_ns(recorded.message)
+        plane, stamp = infos[recorded.topic], stamp_ns(recorded.message)
         if copy:
             copy(recorded, stamp)
         try:
+            entry = camera(recorded.message)
             if known[plane] and known[plane][-1][1] == entry:
                 entry = known[plane][-1][1]     # one object a camera, however often it was sent
             else:
