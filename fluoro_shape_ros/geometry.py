@@ -13,6 +13,8 @@ from scipy.linalg import rq
 from .data import Distortion, View
 
 MIN_PLANE_ANGLE = np.deg2rad(5.0)   # below it depth is a guess: triangulation errors grow as 1 / sin(angle)
+PARALLEL = np.deg2rad(1.0)          # central rays below it are meant not to meet
+STEREO_SHIFT = 0.25                 # of their width: how far apart the images of a stereo pair show what it looks at
 
 
 class GeometryError(ValueError):
@@ -59,14 +61,14 @@ def plane_angle(views: tuple[View, View]) -> float:
 
 
 def check_pair(views: tuple[View, View]) -> None:
-    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel without a baseline."""
+    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel without a baseline across."""
     sources = [source(v.P) for v in views]
-    baseline = np.linalg.norm(sources[0] - sources[1])
-    depth = max(np.linalg.norm(s) for s in sources) + 1e-3
+    apart = sources[1] - sources[0]
+    baseline, far = np.linalg.norm(apart), max(np.linalg.norm(s) for s in sources) + 1e-3
     if baseline < 1e-3:
         raise GeometryError(f'the sources of planes a and b coincide ({baseline * 1000:.2g} mm apart): no depth can be seen')
     # A rectified stereo pair has parallel axes but sees depth through its baseline; biplane sees it through the angle.
-    if plane_angle(views) < MIN_PLANE_ANGLE and baseline < 0.02 * depth:
+    if plane_angle(views) < MIN_PLANE_ANGLE and np.linalg.norm(np.cross(apart, views[0].P[2, :3])) < 0.02 * far:
         raise GeometryError(f'planes a and b are parallel ({np.rad2deg(plane_angle(views)):.2g} degrees): no depth can be seen')
 
 
@@ -94,13 +96,19 @@ def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
 
 
 def isocenter(views: tuple[View, View]) -> np.ndarray:
-    """(3,) m, the point nearest to both central rays (through the image centres): where a biplane system looks."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for v in views:
-        d = np.linalg.solve(v.P[:, :3], [(v.width - 1) / 2, (v.height - 1) / 2, 1.0])
-        across = np.eye(3) - np.outer(d, d) / (d @ d)
-        A, b = A + across, b + across @ source(v.P)
-    return np.linalg.lstsq(A, b, rcond=None)[0]
+    """(3,) m, where two planes look: for a biplane system the point nearest to both central rays (through the image centres).
+
+    Those of a rectified stereo pair are parallel: it looks at the distance where its images are STEREO_SHIFT apart.
+    """
+    sources = np.stack([source(v.P) for v in views])
+    rays = np.stack([np.linalg.solve(v.P[:, :3], [(v.width - 1) / 2, (v.height - 1) / 2, 1.0]) for v in views])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    if np.linalg.norm(np.cross(*rays)) < np.sin(PARALLEL):
+        baseline = np.linalg.norm(np.cross(sources[1] - sources[0], rays[0]))
+        focal_px = np.sqrt(abs(np.linalg.det(views[0].P[:, :3])))
+        return sources.mean(axis=0) + rays[0] * focal_px * baseline / (STEREO_SHIFT * views[0].width)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    return np.linalg.lstsq(across.sum(axis=0), np.einsum('vij,vj->i', across, sources), rcond=None)[0]
 
 
 def fundamental(Pa: np.ndarray, Pb: np.ndarray) -> np.ndarray:
