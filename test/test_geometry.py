@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry import (GeometryError, check_pair, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
+from fluoro_shape_ros.geometry import (GeometryError, check_pair, check_scale, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
                                        pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
 
 K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])
@@ -104,6 +104,16 @@ def test_planes_that_see_no_depth_are_named():
     with pytest.raises(GeometryError, match='parallel'):
         check_pair((A, make_view('b', shifted, 101, 81)))
     check_pair((A, B))
+
+
+def test_a_source_where_the_planes_look_is_named():
+    """The device would be as wide as the image, and filters without end be made for it: 1000 px a radian, 81 px high, radius 20.25 mm at 1 m."""
+    check_scale((A, B), 0.0202)
+    with pytest.raises(GeometryError, match='plane a: a device of radius 20.3 mm would be 40.6 px wide'):
+        check_scale((A, B), 0.0203)
+    here = make_view('b', K @ np.array([[0, 0, -1.0, 0], [0, 1, 0, 0], [1, 0, 0, 0]]), 101, 81)
+    with pytest.raises(GeometryError, match='plane b: .* px wide'):
+        check_scale((A, here), 0.0006)
 
 
 @pytest.mark.parametrize('model, D', [('plumb_bob', [-0.2, 0.05, 1e-3, -2e-3, 0.01]), ('rational_polynomial', [0.3, 0.1, 0, 0, 0.02, 0.1, 0.05, 0.01]),
