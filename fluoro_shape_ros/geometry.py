@@ -111,6 +111,15 @@ def isocenter(views: tuple[View, View]) -> np.ndarray:
     return np.linalg.lstsq(across.sum(axis=0), np.einsum('vij,vj->i', across, sources), rcond=None)[0]
 
 
+def check_scale(views: tuple[View, View], radius: float) -> None:
+    """Raises GeometryError where a device of `radius` (m) would be half as wide as an image, or wider, at the `isocenter`: no C-arm stands so near."""
+    for v in views:
+        with np.errstate(divide='ignore'):
+            half_width_px = radius * pixels_per_metre(v.P, isocenter(views)[None])
+        if not half_width_px < min(v.width, v.height) / 4:
+            raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be {2 * half_width_px:.3g} px wide where the planes look')
+
+
 def fundamental(Pa: np.ndarray, Pb: np.ndarray) -> np.ndarray:
     """(3, 3) F with x_b^T F x_a = 0, unit norm: F = [e_b]x P_b P_a^+ (HZ eq. 9.1)."""
     e = Pb @ np.append(source(Pa), 1.0)

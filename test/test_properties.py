@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip('hypothesis')
 
 from generated import examples                          # noqa: E402
-from hypothesis import given                            # noqa: E402
+from hypothesis import example, given                   # noqa: E402
 from hypothesis import strategies as st                     # noqa: E402
 
 from fluoro_shape_ros.config import Config                  # noqa: E402
@@ -153,6 +153,7 @@ GREYS = st.one_of(
 
 
 @examples(2)
+@example(info(), info(p=projection(np.pi / 2, 0.0).ravel().tolist()), LINE, LINE, 'paper', 'dark')      # its source lies where the planes look
 @given(camera_infos(), camera_infos(projection(np.pi / 2)), GREYS, GREYS, st.sampled_from(['spline', 'paper']), st.sampled_from(['dark', 'bright', 'auto']))
 def test_a_pair_that_is_accepted_is_answered(info_a, info_b, image_a, image_b, method, polarity):
     """No arithmetic on absurd but acceptable cameras and pixels ends in anything but an outcome."""
