@@ -8,8 +8,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter1d
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from .curve import arc_length
@@ -129,38 +127,57 @@ def _no_ridges() -> Ridges:
 def _branches(u, v, su, sv, z, shape, kink: int) -> Ridges:
     """Cut the ridge pixels at junctions and sort them along their branches; where one turns sharply within `kink` points, two lines touch."""
     pairs = _neighbour_pairs(u, v, shape)
-    degree = np.bincount(pairs.ravel(), minlength=len(u))
-    alive = degree <= 2
+    alive = np.bincount(pairs.ravel(), minlength=len(u)) <= 2
     pairs = pairs[alive[pairs].all(axis=1)]
-    # closed loops have no end to start from: open them at their first pixel
-    degree = np.bincount(pairs.ravel(), minlength=len(u))
-    count, label = connected_components(_graph(pairs, len(u)), directed=False)
-    has_end = np.zeros(count, bool)
-    has_end[label[degree <= 1]] = True
-    _, first = np.unique(label, return_index=True)
-    alive[first[~has_end]] = False
-    pairs = pairs[alive[pairs].all(axis=1)]
-    degree = np.bincount(pairs.ravel(), minlength=len(u))
-    graph = _graph(pairs, len(u))
-    count, label = connected_components(graph, directed=False)
-    ends = np.nonzero(degree <= 1)[0]
-    _, k = np.unique(label[ends], return_index=True)
-    along = dijkstra(graph, directed=False, indices=ends[k], min_only=True)
-    order = np.lexsort((along, label))
-    order = order[alive[order]]
+    label, place, rings = _walk(pairs, len(u))
+    if rings.any():     # a ring has no end to start from: open it at its first pixel
+        opened = _walk(pairs[(label[pairs[:, 0]] < 0) & ~rings[pairs].any(axis=1)], len(u))
+        label, place = np.maximum(label, opened[0]), np.maximum(place, opened[1])
+    order = np.lexsort((place, label))[np.count_nonzero(label < 0):]
     if not len(order):
         return _no_ridges()
     return _split_at_kinks(np.c_[su, sv][order], z[order], label[order], kink)
 
 
+def _walk(pairs: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n,) label and (n,) place of each of n pixels along the open line it is in, -1 where it is in none; and (n,) bool: the first pixels of rings.
+
+    pairs: (E, 2) neighbours, at most two a pixel. Each pair is a step either way; from step to step, then from 2nd to 2nd, 4th to 4th ... until all
+    know where they end (pointer jumping, Wyllie 1979).
+    """
+    label, place, rings = np.full(n, -1), np.full(n, -1), np.zeros(n, bool)
+    if not len(pairs):
+        return label, place, rings
+    count = len(pairs)
+    tail, head = np.concatenate([pairs[:, 0], pairs[:, 1]]), np.concatenate([pairs[:, 1], pairs[:, 0]])
+    step = np.arange(2 * count)
+    back = np.roll(step, count)
+    leaving = np.full((2, n), -1)       # steps that leave each pixel: the first and the last in the list
+    leaving[0, tail[::-1]], leaving[1, tail] = step[::-1], step
+    one, two = leaving[:, head]
+    after = np.where(one != back, one, two)
+    last = after == back                # nothing but the way back: the line ends here
+    after = np.where(last, step, after)
+    steps, lowest = np.where(last, 0, 1), np.minimum(tail, head)
+    for _ in range(int(np.ceil(np.log2(count))) + 1):
+        steps, lowest, after = steps + steps[after], np.minimum(lowest, lowest[after]), after[after]
+    ring = ~last[after]
+    rings[lowest[ring]] = True
+    end = head[after]
+    towards = ~ring & (end < end[back])     # every line has two ends; steps towards the lower one count places
+    label[tail[towards]], place[tail[towards]] = end[towards], steps[towards] + 1
+    label[head[towards]], place[head[towards]] = end[towards], steps[towards]
+    return label, place, rings
+
+
 def _split_at_kinks(points: np.ndarray, z: np.ndarray, label: np.ndarray, k: int) -> Ridges:
     """Branches of (M, 2) points sorted by their (M,) label, cut where one turns by MAX_KINK within `k` points."""
-    turn = np.zeros(len(label))
+    sharp = np.zeros(len(label), np.uint8)
     if len(label) > 2 * k:
         before, after = points[k:-k] - points[:-2 * k], points[2 * k:] - points[k:-k]
-        cosine = (before * after).sum(axis=1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1) + 1e-9)
-        turn[k:-k] = np.where(label[:-2 * k] == label[2 * k:], np.arccos(np.clip(cosine, -1, 1)), 0)
-    sharp = maximum_filter1d((turn > MAX_KINK).astype(np.uint8), 3) > 0
+        cosine = (before * after).sum(axis=1) / np.sqrt((before**2).sum(axis=1) * (after**2).sum(axis=1) + 1e-18)
+        sharp[k:-k] = (label[:-2 * k] == label[2 * k:]) & (cosine < np.cos(MAX_KINK))
+    sharp = maximum_filter1d(sharp, 3) > 0
     cut = np.diff(label, prepend=label[0]) != 0
     cut |= np.diff(sharp.astype(np.int8), prepend=0) != 0
     piece, keep = np.cumsum(cut), ~sharp
@@ -183,10 +200,6 @@ def _neighbour_pairs(u: np.ndarray, v: np.ndarray, shape) -> np.ndarray:
         ok = (other >= 0) & (index[at + corner_1] < 0) & (index[at + corner_2] < 0)
         pairs.append(np.c_[here, other][ok])
     return np.concatenate(pairs)
-
-
-def _graph(pairs: np.ndarray, n: int):
-    return coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsr()
 
 
 @dataclass(frozen=True)

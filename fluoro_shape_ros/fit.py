@@ -13,12 +13,13 @@ import numpy as np
 
 from .curve import arc_length
 from .extent import End, bulge, locate, supported
-from .geometry import pixels_per_metre
+from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Solution, solve
 from .spline import Spline3, prolong, through
 from .strips import Measurement, Strips, apparent_width, cut, half_width_range, mean_profile, measure, own_shadow, pieces, search, shadow
 
 COARSE, FINE = 2, 3
+MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 COARSE_STEP = 3         # px between the strips of a coarse round
 SETTLED_PX = 0.05       # a fine round that moves the curve less is the last
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
@@ -59,11 +60,13 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
     """
     scale = [pixels_per_metre(v.P, points) for v in views]
     half_width = [radius * k for k in scale]
+    step, length = 1 / max(scale), arc_length(points)[-1]
+    if max(half_width) > MAX_HALF_WIDTH_PX or length > sum(v.width + v.height for v in views) * step or min(depth(v.P, points).min() for v in views) <= 0:
+        return None     # no start: it goes to a source, or out of the images and back
     reach = half_width_range(max(half_width))
     template = _shadows(half_width, np.arange(-reach, reach + 1))
-    step = 1 / max(scale)
     spline = through(points, EXTENSION_PX * step)
-    reference = (0.0, arc_length(points)[-1])
+    reference = (0.0, length)
     grown, length_px = 0, 0.0
     rounds = [True] * coarse + [False] * FINE
     while rounds:
