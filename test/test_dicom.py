@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip('rosbags')
 pytest.importorskip('mcap')
-pydicom = pytest.importorskip('pydicom', '3.0')
+pydicom = pytest.importorskip('pydicom', '3.0.1')
 
 from drawing import SIZE, curve                                             # noqa: E402
 from pydicom.dataset import Dataset, FileMetaDataset                        # noqa: E402
