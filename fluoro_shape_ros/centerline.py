@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter1d
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+
+from .curve import arc_length
 
 RIDGE_Z = 3.5           # ridge points stand out from the noise by this many standard deviations ...
 BRANCH_Z = 5.0          # ... and branches by this, on average over their best half
 MAX_RIDGE_SHARE = 0.015 # of the pixels, at most: the strongest
 FEW_RIDGES = 16000      # pixels that are never too many
+NARROWEST_PX = 0.9      # half the width that a device keeps at least, and ...
+FINEST_SIGMA = 0.75     # ... the scale, where it is looked for in a smaller image
 FAINTEST = 0.01         # of the strongest ridge
 ONE_SIDED = 0.15        # the side that is less bright rises at least this much of the mean
 NMS_PX = 0.75           # a ridge point lies within this of its pixel's centre (0.5, and some for noise)
-KINK_PX = 6             # a branch that turns by more than this within so many points to either side is two lines that touch
+KINK_PX = 6             # a branch that turns by more than MAX_KINK within this to either side is two lines that touch
 MAX_KINK = np.deg2rad(38)
 END_PX = 12             # length over which the direction of a branch's end is measured
+BRANCHES = 90           # strongest ones of an image that are linked
 GAP_PX = 48.0           # longest gap that is bridged, where it is straight
 MAX_TURN = np.deg2rad(50)    # ... the direction may change by this over a short gap
 
@@ -31,6 +36,12 @@ class Ridges:
     points_px: np.ndarray   # (M, 2)
     z: np.ndarray           # (M,) strength in standard deviations of the noise
     start: np.ndarray       # (B + 1,) branch b is start[b]:start[b + 1]
+    step_px: int = 1        # distance of the points along a ridge
+
+
+def shrinking(half_width_px: float) -> int:
+    """By how much an image may be made smaller, 1, 2 or 4, before lines of this half width are looked for in it."""
+    return next((k for k in (4, 2) if half_width_px / k >= NARROWEST_PX and ridge_scale(half_width_px) / k >= FINEST_SIGMA), 1)
 
 
 def ridge_scale(half_width_px: float) -> float:
@@ -38,8 +49,28 @@ def ridge_scale(half_width_px: float) -> float:
     return max(1.2, 1.2 * float(np.hypot(0.5 * half_width_px, 0.8)))
 
 
-def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float) -> Ridges:
-    """Ridges of dark lines of scale `sigma` px in an (H, W) float32 image, inside the (H, W) field (Steger 1998)."""
+def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int = 1) -> Ridges:
+    """Ridges of dark lines of scale `sigma` px in an (H, W) float32 image, inside the (H, W) field (Steger 1998).
+
+    `shrink`: looked for in an image so many times smaller; points are still pixels of the image given.
+    """
+    if shrink > 1:
+        size = image.shape[1] // shrink, image.shape[0] // shrink
+        image, field = (a[:size[1] * shrink, :size[0] * shrink] for a in (image, field))
+        small = _ridges(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.resize(field, size, interpolation=cv2.INTER_NEAREST), sigma / shrink, shrink)
+        return Ridges(small.points_px * shrink + (shrink - 1) / 2, small.z, small.start, shrink)
+    return _ridges(image, field, sigma, 1)
+
+
+@lru_cache(64)
+def _noise_ratio(sigma: float) -> float:
+    """Standard deviation of 2 I_uu over that of 2 I_uv of white noise, smoothed and differentiated as in `_ridges`."""
+    smooth = cv2.getGaussianKernel(2 * int(4 * sigma + 1) + 1, sigma).ravel()
+    straight, first, second = (np.linalg.norm(np.convolve(smooth, k)) for k in ([1.0], [-0.5, 0, 0.5], [1, -2, 1]))
+    return float(straight * second / first**2)
+
+
+def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> Ridges:
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
     second, one, first = np.float32([1, -2, 1]), np.float32([1]), np.float32([-0.5, 0, 0.5])
     uu = cv2.sepFilter2D(smooth, cv2.CV_32F, second, one)
@@ -47,15 +78,15 @@ def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float) -> Ridges:
     uv = cv2.sepFilter2D(smooth, cv2.CV_32F, 2 * first, first)              # 2 I_uv
     l2 = cv2.magnitude(cv2.subtract(uu, vv), uv)
     cv2.add(l2, cv2.add(uu, vv), dst=l2)                                    # 2 l2, the larger eigenvalue of the Hessian
-    margin = int(3 * sigma)
+    margin = int(np.ceil(3 * sigma))
     inside = cv2.erode(field, np.ones((2 * margin + 1,) * 2, np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     stride = 31 if image.shape[1] % 31 else 29      # no row or column is favoured: a device may lie along one
     some = inside.ravel()[::stride] > 0
     if not some.any():
         return _no_ridges()
-    noise = np.sqrt(3) * 1.4826 * float(np.median(np.abs(uv.ravel()[::stride][some]))) + 1e-12  # white noise: Var(uu) = 3 Var(uv); of 2 l2
+    noise = _noise_ratio(sigma) * 1.4826 * float(np.median(np.abs(uv.ravel()[::stride][some]))) + 1e-12    # of 2 l2
     sample = l2.ravel()[::stride][some]
-    enough = int((1 - min(max(MAX_RIDGE_SHARE, FEW_RIDGES / image.size), 0.9)) * len(sample))
+    enough = int((1 - min(max(shrink * MAX_RIDGE_SHARE, FEW_RIDGES / (shrink * image.size)), 0.9)) * len(sample))
     faintest = FAINTEST * max(cv2.norm(l2, cv2.NORM_INF), float(smooth.max()) * 1e-3)           # without noise, rounding is no ridge
     level = max(RIDGE_Z * noise, faintest, float(np.partition(sample, enough)[enough]))
     found = cv2.findNonZero(cv2.bitwise_and(cv2.compare(l2, level, cv2.CMP_GT), inside))
@@ -86,49 +117,67 @@ def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float) -> Ridges:
     rival = index[beside]
     keep = keep[(rival < 0) | (far < far[rival]) | ((far == far[rival]) & (at[keep] < beside))]
     u, v = u[keep], v[keep]
-    return _branches(u, v, u + du[keep], v + dv[keep], 2 * strength[keep] / noise, image.shape)
+    return _branches(u, v, u + du[keep], v + dv[keep], 2 * strength[keep] / noise, image.shape, max(KINK_PX // shrink, 3))
 
 
 def _no_ridges() -> Ridges:
     return Ridges(np.empty((0, 2)), np.empty(0), np.zeros(1, int))
 
 
-def _branches(u, v, su, sv, z, shape) -> Ridges:
-    """Cut the ridge pixels at junctions and sort them along their branches."""
+def _branches(u, v, su, sv, z, shape, kink: int) -> Ridges:
+    """Cut the ridge pixels at junctions and sort them along their branches; where one turns sharply within `kink` points, two lines touch."""
     pairs = _neighbour_pairs(u, v, shape)
-    degree = np.bincount(pairs.ravel(), minlength=len(u))
-    alive = degree <= 2
+    alive = np.bincount(pairs.ravel(), minlength=len(u)) <= 2
     pairs = pairs[alive[pairs].all(axis=1)]
-    # closed loops have no end to start from: open them at their first pixel
-    degree = np.bincount(pairs.ravel(), minlength=len(u))
-    count, label = connected_components(_graph(pairs, len(u)), directed=False)
-    has_end = np.zeros(count, bool)
-    has_end[label[degree <= 1]] = True
-    _, first = np.unique(label, return_index=True)
-    alive[first[~has_end]] = False
-    pairs = pairs[alive[pairs].all(axis=1)]
-    degree = np.bincount(pairs.ravel(), minlength=len(u))
-    graph = _graph(pairs, len(u))
-    count, label = connected_components(graph, directed=False)
-    ends = np.nonzero(degree <= 1)[0]
-    _, k = np.unique(label[ends], return_index=True)
-    along = dijkstra(graph, directed=False, indices=ends[k], min_only=True)
-    order = np.lexsort((along, label))
-    order = order[alive[order]]
+    label, place, rings = _walk(pairs, len(u))
+    if rings.any():     # a ring has no end to start from: open it at its first pixel
+        opened = _walk(pairs[(label[pairs[:, 0]] < 0) & ~rings[pairs].any(axis=1)], len(u))
+        label, place = np.maximum(label, opened[0]), np.maximum(place, opened[1])
+    order = np.lexsort((place, label))[np.count_nonzero(label < 0):]
     if not len(order):
         return _no_ridges()
-    return _split_at_kinks(np.c_[su, sv][order], z[order], label[order])
+    return _split_at_kinks(np.c_[su, sv][order], z[order], label[order], kink)
 
 
-def _split_at_kinks(points: np.ndarray, z: np.ndarray, label: np.ndarray) -> Ridges:
-    """Branches of (M, 2) points sorted by their (M,) label; where one turns sharply, two lines touch, and it is cut."""
-    k = KINK_PX
-    turn = np.zeros(len(label))
+def _walk(pairs: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n,) label and (n,) place of each of n pixels along the open line it is in, -1 where it is in none; and (n,) bool: the first pixels of rings.
+
+    pairs: (E, 2) neighbours, at most two a pixel. Each pair is a step either way; from step to step, then from 2nd to 2nd, 4th to 4th ... until all
+    know where they end (pointer jumping, Wyllie 1979).
+    """
+    label, place, rings = np.full(n, -1), np.full(n, -1), np.zeros(n, bool)
+    if not len(pairs):
+        return label, place, rings
+    count = len(pairs)
+    tail, head = np.concatenate([pairs[:, 0], pairs[:, 1]]), np.concatenate([pairs[:, 1], pairs[:, 0]])
+    step = np.arange(2 * count)
+    back = np.roll(step, count)
+    leaving = np.full((2, n), -1)       # steps that leave each pixel: the first and the last in the list
+    leaving[0, tail[::-1]], leaving[1, tail] = step[::-1], step
+    one, two = leaving[:, head]
+    after = np.where(one != back, one, two)
+    last = after == back                # nothing but the way back: the line ends here
+    after = np.where(last, step, after)
+    steps, lowest = np.where(last, 0, 1), np.minimum(tail, head)
+    for _ in range(int(np.ceil(np.log2(count))) + 1):
+        steps, lowest, after = steps + steps[after], np.minimum(lowest, lowest[after]), after[after]
+    ring = ~last[after]
+    rings[lowest[ring]] = True
+    end = head[after]
+    towards = ~ring & (end < end[back])     # every line has two ends; steps towards the lower one count places
+    label[tail[towards]], place[tail[towards]] = end[towards], steps[towards] + 1
+    label[head[towards]], place[head[towards]] = end[towards], steps[towards]
+    return label, place, rings
+
+
+def _split_at_kinks(points: np.ndarray, z: np.ndarray, label: np.ndarray, k: int) -> Ridges:
+    """Branches of (M, 2) points sorted by their (M,) label, cut where one turns by MAX_KINK within `k` points."""
+    sharp = np.zeros(len(label), np.uint8)
     if len(label) > 2 * k:
         before, after = points[k:-k] - points[:-2 * k], points[2 * k:] - points[k:-k]
-        cosine = (before * after).sum(axis=1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1) + 1e-9)
-        turn[k:-k] = np.where(label[:-2 * k] == label[2 * k:], np.arccos(np.clip(cosine, -1, 1)), 0)
-    sharp = maximum_filter1d((turn > MAX_KINK).astype(np.uint8), 3) > 0
+        cosine = (before * after).sum(axis=1) / np.sqrt((before**2).sum(axis=1) * (after**2).sum(axis=1) + 1e-18)
+        sharp[k:-k] = (label[:-2 * k] == label[2 * k:]) & (cosine < np.cos(MAX_KINK))
+    sharp = maximum_filter1d(sharp, 3) > 0
     cut = np.diff(label, prepend=label[0]) != 0
     cut |= np.diff(sharp.astype(np.int8), prepend=0) != 0
     piece, keep = np.cumsum(cut), ~sharp
@@ -153,10 +202,6 @@ def _neighbour_pairs(u: np.ndarray, v: np.ndarray, shape) -> np.ndarray:
     return np.concatenate(pairs)
 
 
-def _graph(pairs: np.ndarray, n: int):
-    return coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsr()
-
-
 @dataclass(frozen=True)
 class Candidate:
     """A chain of branches that may be the device."""
@@ -171,10 +216,16 @@ def find_candidates(ridges: Ridges, min_length_px: float, count: int = 8) -> lis
     branches = _strong_branches(ridges)
     if not branches:
         return []
-    partner = _link_ends(branches)
-    chains = [_join(branches, chain) for chain in _follow(partner, len(branches))]
-    candidates = [c for c in chains if np.linalg.norm(np.diff(c.points_px, axis=0), axis=1).sum() >= min_length_px]
-    return sorted(candidates, key=lambda c: -c.score)[:count]
+    chains = _follow(_link_ends(branches, ridges.step_px), len(branches))
+    strength = [sum(branches[entry // 2][1].sum() for entry in chain) for chain in chains]
+    candidates = []
+    for k in np.argsort(-np.array(strength)):
+        line = _join(branches, chains[k], ridges.step_px)
+        if arc_length(line.points_px)[-1] >= min_length_px:
+            candidates.append(line)
+        if len(candidates) == count:
+            break
+    return candidates
 
 
 def _strong_branches(ridges: Ridges) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -183,39 +234,32 @@ def _strong_branches(ridges: Ridges) -> list[tuple[np.ndarray, np.ndarray]]:
     if not len(ridges.z):
         return []
     mean = np.add.reduceat(ridges.z, ridges.start[:-1]) / length
-    excess = (mean - RIDGE_Z) * np.sqrt(length)
-    good = np.nonzero((length >= 5) & (mean > BRANCH_Z) & (excess > 8.0))[0]
-    good = good[np.argsort(-(mean * length)[good])][:90]
+    excess = (mean - RIDGE_Z) * np.sqrt(length * ridges.step_px)
+    good = np.nonzero((length >= max(5 // ridges.step_px, 3)) & (mean > BRANCH_Z) & (excess > 8.0))[0]
+    good = good[np.argsort(-(mean * length)[good])][:BRANCHES]
     return [(ridges.points_px[ridges.start[b]:ridges.start[b + 1]], ridges.z[ridges.start[b]:ridges.start[b + 1]]) for b in good]
 
 
-def _link_ends(branches) -> np.ndarray:
+def _link_ends(branches, step_px: int) -> np.ndarray:
     """(2 B,) for each branch end (2 b: first, 2 b + 1: last) the end it continues in, or -1: best continuations first, each end once."""
-    ends, out, strength = [], [], []
-    for points, z in branches:
-        n = min(END_PX, len(points))
-        for e in (points[:n], points[::-1][:n]):
-            d = e[0] - e[-1]
-            ends.append(e[0])
-            out.append(d / (np.linalg.norm(d) + 1e-9))
-        strength += [z.mean()] * 2
-    ends, out, strength = np.array(ends), np.array(out), np.array(strength)
-    gap = ends[None] - ends[:, None]                                    # from i to j
-    d = np.linalg.norm(gap, axis=2)
-    slack = 1.5 / np.maximum(d, 1.5)                                    # direction of a short gap is uncertain
-    along = gap / np.maximum(d, 1e-9)[..., None]
-    turn_i = np.arccos(np.clip(np.einsum('ijk,ik->ij', along, out), -1, 1))
-    turn_j = np.arccos(np.clip(-np.einsum('ijk,jk->ij', along, out), -1, 1))
-    between = np.arccos(np.clip(-out @ out.T, -1, 1))
-    turn = np.maximum(between, np.maximum(turn_i, turn_j) - np.arcsin(np.clip(slack, 0, 1)))
-    ratio = np.abs(np.log(strength[:, None] / strength))
+    inner = [min(END_PX // step_px, len(p)) - 1 for p, _ in branches]
+    ends = np.array([e for p, _ in branches for e in (p[0], p[-1])])
+    out = ends - np.array([e for (p, _), n in zip(branches, inner) for e in (p[n], p[-1 - n])])
+    out /= np.linalg.norm(out, axis=1, keepdims=True) + 1e-9
+    strength = np.repeat([z.mean() for _, z in branches], 2)
+    i, j = cKDTree(ends).query_pairs(GAP_PX, output_type='ndarray').T
+    i, j = (x[i // 2 != j // 2] for x in (i, j))
+    gap = ends[j] - ends[i]
+    d = np.linalg.norm(gap, axis=1)
+    slack = 1.5 * step_px / np.maximum(d, 1.5 * step_px)                    # direction of a short gap is uncertain
+    along = gap / np.maximum(d, 1e-9)[:, None]
+    turn_i, turn_j, between = (np.arccos(np.clip((a * b).sum(axis=1), -1, 1)) for a, b in ((along, out[i]), (-along, out[j]), (-out[i], out[j])))
+    turn = np.maximum(between, np.maximum(turn_i, turn_j) - np.arcsin(slack))
+    ratio = np.abs(np.log(strength[i] / strength[j]))
     cost = d / GAP_PX + (turn / MAX_TURN) ** 2 + 0.5 * ratio
-    own = np.arange(len(ends)) // 2
-    cost[(own[:, None] == own) | (d > GAP_PX) | (turn > MAX_TURN * (1 - 0.6 * d / GAP_PX)) | (ratio > 1.5)] = np.inf
     partner = np.full(len(ends), -1)
-    i, j = np.nonzero(np.triu(np.isfinite(cost)))
-    for k in np.argsort(cost[i, j]):
-        if partner[i[k]] < 0 and partner[j[k]] < 0:
+    for k in np.argsort(cost, kind='stable'):
+        if turn[k] <= MAX_TURN * (1 - 0.6 * d[k] / GAP_PX) and ratio[k] <= 1.5 and partner[i[k]] < 0 and partner[j[k]] < 0:
             partner[i[k]], partner[j[k]] = j[k], i[k]
     return partner
 
@@ -235,17 +279,21 @@ def _follow(partner: np.ndarray, count: int) -> list[list[int]]:
     return chains
 
 
-def _join(branches, chain: list[int]) -> Candidate:
+def _join(branches, chain: list[int], step_px: int) -> Candidate:
+    """One line from the branches of a chain, a point about every px."""
     points, z = [], []
     for entry in chain:
         p, q = branches[entry // 2]
         if entry % 2:
             p, q = p[::-1], q[::-1]
         if points:
-            n = int(np.linalg.norm(p[0] - points[-1][-1]))
+            n = int(np.hypot(*(p[0] - points[-1][-1])) / step_px)
             points.append(np.linspace(points[-1][-1], p[0], n + 1)[1:-1].reshape(-1, 2) if n > 1 else p[:0])
             z.append(np.zeros(len(points[-1])))
         points.append(p)
         z.append(q)
     points, z = np.concatenate(points), np.concatenate(z)
+    if step_px > 1:
+        at = np.linspace(0, len(z) - 1, step_px * (len(z) - 1) + 1)
+        points, z = np.stack([np.interp(at, np.arange(len(z)), x) for x in points.T], axis=1), z[np.round(at).astype(int)]
     return Candidate(points, z, float(z.sum()))

@@ -104,10 +104,21 @@ def fields() -> list[dataclasses.Field]:
     return [f for stage in dataclasses.fields(default) for f in dataclasses.fields(getattr(default, stage.name))]
 
 
+def constraint(f: dataclasses.Field) -> str:
+    """What else a value of parameter `f` must be, in words; empty where its type and range say it all."""
+    m = f.metadata
+    if m['choices']:
+        return f'one of: {", ".join(m["choices"])}'
+    if m['element'] is None:
+        return ''
+    lengths, _, reason = _LISTS[f.name]
+    return ', '.join(filter(None, (f'none or {max(lengths)} numbers', reason)))
+
+
 # what a list parameter must look like beyond its element type: name -> (allowed lengths, rule, reason)
 _LISTS = {
     'base_position': ((0, 3), lambda v: True, ''),
-    'expected_length': ((0, 2), lambda v: not v or 0 <= v[0] < v[1], 'needs 0 <= min < max'),
+    'expected_length': ((0, 2), lambda v: not v or 0 <= v[0] < v[1], '0 <= min < max'),
 }
 
 
@@ -120,7 +131,7 @@ def _checked(f: dataclasses.Field, value):
         if len(value) not in lengths:
             raise ConfigError(f'{f.name}: needs {" or ".join(map(str, lengths))} numbers, got {len(value)}')
         if not rule(value):
-            raise ConfigError(f'{f.name}: {reason}, got {list(value)}')
+            raise ConfigError(f'{f.name}: needs {reason}, got {list(value)}')
         return value
     kind = type(f.default)
     if kind is float:

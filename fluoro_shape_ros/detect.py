@@ -8,23 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .centerline import Candidate, find_candidates, find_ridges, ridge_scale
+from .centerline import Candidate, find_candidates, find_ridges, ridge_scale, shrinking
 from .data import Outcome
 from .fit import Fit, continues, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
 from .start import first_curve
-from .strips import cut_along, half_width_range, likeness, mean_profile
+from .strips import apparent_width, cut_along, half_width_range, pieces
 
 LINES = 14              # strongest lines of an image that are looked at closely
 CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...
 HOPELESS = 0.03         # ... unless they are that much less like it than the best
 HYPOTHESES = 4          # alignments that are fitted before one is chosen
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
-LENIENT = 0.25          # the same where no other line competes: robot_radius may be off by a third
 UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
+USUAL_WIDTH, WIDTH_RATIO = 0.88, 0.3   # as wide as this, and natural logarithm of what it varies by: robot_radius, sharpness of the image
 EXPLAINED_PX = 3.0
-MIN_EXPLAINED = 0.85    # less of a line than this, and it is another line or only a part of the device is fitted
+MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it
 NO_TIP = 0.2            # what is left of a line that leaves the field at both ends: it has no tip to show
 
@@ -59,7 +59,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
             lines = curves[0][alignment.a], curves[1][alignment.b]
             taken = candidates[0][alignment.a], candidates[1][alignment.b]
             share = min(explained(fitted, v, line, c.z > 0) for v, line, c in zip(views, lines, taken))
-            fits.append((share**2 * evidence(fitted), fitted, share, tuple(c.points_px for c in taken)))
+            fits.append((share * evidence(fitted), fitted, share, tuple(c.points_px for c in taken)))
             if fits[-1][0] > CONVINCING * np.sqrt(fitted.stop - fitted.start):
                 break
     if not fits:
@@ -73,7 +73,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
 def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
     fitted = fit(images, fields, views, points, radius, coarse=1)
-    if fitted is None or evidence(fitted, LENIENT) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
+    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
         return None
     ends = np.linspace(fitted.start, fitted.stop, 100)
     return Detection(fitted, Outcome.OK, 'ok', tuple(distort(v, project(v.P, fitted.spline(ends))) for v in views))
@@ -81,12 +81,12 @@ def track(images, fields, views, radius: float, points: np.ndarray) -> Detection
 
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:
     """The lines of one image that look most like a device of this width, best first; `score` is how much, at most 1."""
-    lines = find_candidates(find_ridges(image, field, ridge_scale(half_width_px)), min_length_px, count=LINES)
-    scored = []
-    for line in lines:
-        strips = cut_along(image, field, line.points_px, half_width_range(half_width_px))
-        alike = likeness(mean_profile(strips, np.ones(len(strips.profiles), bool)), half_width_px)
-        scored.append(replace(line, score=float(np.exp((np.clip(alike, 0, 1) - 1) / UNLIKE))))
+    lines = find_candidates(find_ridges(image, field, ridge_scale(half_width_px), shrinking(half_width_px)), min_length_px, count=LINES)
+    if not lines:
+        return []
+    strips, of = cut_along(image, field, [line.points_px for line in lines], half_width_range(half_width_px))
+    profiles = [pieces(strips.profiles, strips.inside & (of == k)) for k in range(len(lines))]
+    scored = [replace(line, score=alike_device(*apparent_width([p], [half_width_px]))) for line, p in zip(lines, profiles)]
     scored.sort(key=lambda c: -c.score * np.sqrt(len(c.z)))
     return [c for c in scored[:CANDIDATES] if c.score > HOPELESS * scored[0].score]
 
@@ -107,11 +107,16 @@ def explained(f: Fit, view, line_px: np.ndarray, visible: np.ndarray) -> float:
     return float(near[counted].mean()) if counted.any() else 0.0
 
 
-def evidence(f: Fit, unlike: float = UNLIKE) -> float:
-    """How much speaks for a fit: a device looks like a cylinder of its radius, is seen all along and equally dark by both planes, and stops in both at once."""
+def evidence(f: Fit) -> float:
+    """How much speaks for a fit: a device looks like a cylinder of about its radius, is seen all along and equally dark by both planes, and stops in both at once."""
     if f.contrast.min() <= 0:
         return 0.0
     alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * np.exp((np.clip(f.likeness, 0, 1).mean() - 1) / unlike))
+    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.width, f.likeness))
+
+
+def alike_device(width: float, likeness: np.ndarray) -> float:
+    """At most 1: how device-like lines of this apparent width are, by their (V,) likeness with cylinders so wide."""
+    return float(np.exp((np.clip(likeness, 0, 1).mean() - 1) / UNLIKE - 0.5 * (np.log(width / USUAL_WIDTH) / WIDTH_RATIO) ** 2))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from scipy.special import ndtr
@@ -12,9 +14,11 @@ BRIDGED_PX = 70         # a stretch that only one plane shows, or none up to GAP
 GAP_PX = 30
 SMOOTH_PX = 9
 REACH_PX = 12.0         # the edge is looked for this far around the first guess
-BLURS_PX = (0.8, 1.1, 1.5, 2.2)
+COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
+BLURS_PX = (0.8, 1.2, 1.9)
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
 RAMP = 0.1
+DISAGREE_PX = 0.9       # what the planes' ends may differ by, beside noise
 FLOOR_PX = 0.12         # what the model of the edge itself is worth
 
 
@@ -48,51 +52,71 @@ def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.n
     return np.maximum(opaque, 0.5 * (1 - 2 * half_dark)) * radius * np.sqrt(1 - sine**2) / sine
 
 
+@dataclass(frozen=True)
+class End:
+    """Where a device ends along a curve."""
+
+    at: float               # m, by both planes
+    sigma: float            # m, if the planes agree
+    seen_at: np.ndarray     # (2,) m, by each plane alone; NaN where it does not show the end
+    seen_sigma: np.ndarray  # (2,) m
+
+    @property
+    def apart(self) -> float:
+        """m by which the planes differ; 0 where only one shows the end."""
+        return abs(float(np.nan_to_num(self.seen_at[0] - self.seen_at[1])))
+
+    def honest_sigma(self, px_per_m: float) -> float:
+        """sigma in m; where the planes disagree by more than noise, the truth lies somewhere between."""
+        bounds = 3 * float(np.hypot(*self.seen_sigma)) + DISAGREE_PX / px_per_m
+        return float(np.hypot(self.sigma, self.apart / 2)) if self.apart > bounds else self.sigma
+
+
 def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: float, outward: int, beyond: np.ndarray,
-           ramp: float = 0.0) -> tuple[float, float]:
-    """Arc length (m) where the device ends, and its standard deviation (m).
+           ramp: float = 0.0, density: float = 1.0, reach_px: float = REACH_PX) -> End:
+    """Where the device ends.
 
     s: (N,) m. presence: (N, 2), sigma: (2,) its noise, speed: (N, 2) px per m. outward: +1 for the end at large s, -1 at small.
     beyond: (2,) m, see `bulge`. ramp: m over which the end fades in the more foreshortened plane; its model is worth RAMP of that.
+    density: strips a px, so many of which are one observation. reach_px: how far from the guess it is looked for.
     Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
     clipped at 3.5 sigma.
     """
-    here = int(np.argmin(np.abs(s - guess)))
-    px_per_m = np.mean(speed[here])
-    near = np.abs(s - guess) * px_per_m < REACH_PX + 12
-    planes = [v for v in range(2) if (near & np.isfinite(presence[:, v])).sum() >= 12 and np.isfinite(sigma[v])]
-    rows = {v: near & np.isfinite(presence[:, v]) for v in planes}
+    px_per_m = np.mean(speed[int(np.argmin(np.abs(s - guess)))])
+    near = np.abs(s - guess) * px_per_m < reach_px + 12
+    rows = {v: near & np.isfinite(presence[:, v]) for v in range(2) if np.isfinite(sigma[v])}
+    rows = {v: r for v, r in rows.items() if r.sum() >= 12}
+    seen_at, seen_sigma = np.full(2, np.nan), np.full(2, np.nan)
+    if not rows:
+        return End(guess, float('inf'), seen_at, seen_sigma)
 
     def edges(v: int, end: np.ndarray, blurs) -> tuple[np.ndarray, np.ndarray, float]:
         """(E,) cost and information of edges at `end` in plane v, with the blur that fits best."""
-        y, weight = presence[rows[v], v], 1 / max(sigma[v], 0.02) ** 2
+        y, weight = presence[rows[v], v], 1 / (density * max(sigma[v], 0.02) ** 2)
         z = (outward * (end[:, None] - s[rows[v]]) + beyond[v]) * speed[rows[v], v]     # (E, n) px inside the device
         tried = []
         for blur in blurs:
             m = ndtr(z / blur)
             a = np.clip((m @ y) / np.maximum((m * m).sum(axis=1), 1e-9), 0.5, 1.8)
-            cost = np.minimum((y - a[:, None] * m) ** 2 * weight, 12).sum(axis=1)
+            cost = np.minimum((y - a[:, None] * m) ** 2 * weight * density, 12).sum(axis=1) / density
             slope = a[:, None] * np.exp(-0.5 * (z / blur) ** 2) / (blur * np.sqrt(2 * np.pi)) * speed[rows[v], v]
             tried.append((cost, (slope**2).sum(axis=1) * weight, blur))
         return min(tried, key=lambda t: t[0].min())
 
-    wide = end = guess + np.arange(-REACH_PX, REACH_PX + 0.01, 0.6) / px_per_m
-    coarse = {v: edges(v, wide, BLURS_PX) for v in planes}
-    if planes:
-        best = wide[np.argmin(sum(c[0] for c in coarse.values()))]
-        end = best + np.arange(-1.0, 1.01, 0.1) / px_per_m
-    fine = {v: edges(v, end, [coarse[v][2]]) for v in planes}
-    single = [(wide[np.argmin(c)], 1 / np.sqrt(i[np.argmin(c)] + 1e-12)) for c, i, _ in coarse.values()]
-    cost, information = sum(f[0] for f in fine.values()), sum(f[1] for f in fine.values())
-    if not single:
-        return guess, float('inf')
-    k = int(np.clip(np.argmin(cost), 1, len(end) - 2))
-    left, middle, right = cost[k - 1:k + 2]
+    model = (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2 + (RAMP * ramp) ** 2
+    wide = guess + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m
+    coarse = {v: edges(v, wide, BLURS_PX) for v in rows}
+    for v, (cost, information, _) in coarse.items():
+        seen_at[v], seen_sigma[v] = _lowest(wide, cost), np.sqrt(1 / (information[np.argmin(cost)] + 1e-12) + model)
+    fine = wide[np.argmin(sum(c[0] for c in coarse.values()))] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m
+    seen = [edges(v, fine, [coarse[v][2]]) for v in rows]
+    cost, information = sum(c for c, _, _ in seen), sum(i for _, i, _ in seen)
+    return End(_lowest(fine, cost), float(np.sqrt(1 / (information[np.argmin(cost)] + 1e-12) + model)), seen_at, seen_sigma)
+
+
+def _lowest(x: np.ndarray, y: np.ndarray) -> float:
+    """Where the parabola through the lowest of (N,) values at even x and its neighbours is lowest."""
+    k = min(max(int(np.argmin(y)), 1), len(y) - 2)
+    left, middle, right = y[k - 1:k + 2]
     bow = left - 2 * middle + right
-    at = end[k] + (0.5 * (left - right) / bow * (end[1] - end[0]) if bow > 0 else 0.0)
-    variance = 1 / (information[k] + 1e-12) + (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2 + (RAMP * ramp) ** 2
-    if len(single) == 2:        # planes that disagree by more than noise: the truth lies somewhere between
-        apart = abs(single[0][0] - single[1][0])
-        if apart > 3 * np.hypot(single[0][1], single[1][1]) + 0.9 / px_per_m:
-            variance += (apart / 2) ** 2
-    return float(at), float(np.sqrt(variance))
+    return float(x[k] + (min(max(0.5 * (left - right) / bow, -1.0), 1.0) * (x[1] - x[0]) if bow > 0 else 0.0))

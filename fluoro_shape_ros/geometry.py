@@ -90,8 +90,7 @@ def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
 
 def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
     """Magnification at the mean of (N, 3) points: image px per m across the viewing ray."""
-    K, _, _ = decompose(P)
-    return float(np.sqrt(abs(K[0, 0] * K[1, 1])) / abs(np.mean(depth(P, X))))
+    return float(np.sqrt(abs(np.linalg.det(P[:, :3]))) / abs(np.mean(depth(P, X))))     # det K R = f_u f_v, since |P[2, :3]| = 1
 
 
 def isocenter(views: tuple[View, View]) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import re
 import signal
@@ -64,6 +65,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     from rclpy.qos_overriding_options import InvalidQosOverridesError
 
     from .ros_node import FluoroShapeNode
+    from .transforms import TfMissing
     try:
         rclpy.init(args=argv)
         node = FluoroShapeNode()
@@ -72,6 +74,9 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     except (ConfigError, InvalidQosOverridesError) as error:
         rclpy.try_shutdown()
         return _refuse(error)
+    except TfMissing as error:
+        rclpy.try_shutdown()
+        raise cli.ToolError(error) from error
     except RuntimeError as error:   # rclpy has no type of its own for arguments that it can't parse
         if 'context is invalid' in str(error):      # a signal has shut it down while the node was being made
             return 0
@@ -82,6 +87,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
         return _refuse(message)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    gc.freeze()     # what the imports left stays anyway: to look through all of it now and then would hold up a pair for some 50 ms
     try:
         if not told_to_stop.is_set():   # it may have come before rclpy's handlers
             executor.spin()

@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 from msg_adapters.images import BadImage, array_to_image
 from msg_adapters.markers import rejection_to_markers, shape_to_markers
 from msg_adapters.messages import ros_message
-from msg_adapters.shapes import shape_to_cloud, shape_to_path, shape_to_tip, shape_to_tip_pose
+from msg_adapters.shapes import shape_to_cloud, shape_to_path_cdr, shape_to_tip, shape_to_tip_pose
 
 from .data import Frame, Reconstruction
 from .geometry import isocenter
@@ -21,7 +21,6 @@ from .overlay import overlay, words
 from .pairing import PLANES
 from .worker import Job, decode
 
-ALWAYS = {'backbone': (Path, shape_to_path), 'tip': (PointStamped, shape_to_tip)}
 OF_SHAPES = {'tip_pose': (PoseWithCovarianceStamped, shape_to_tip_pose), 'backbone_points': (PointCloud2, shape_to_cloud)}
 
 
@@ -31,7 +30,7 @@ class Outputs:
     def __init__(self, node: Node):
         def publisher(kind, topic):
             return node.create_publisher(kind, topic, QoSProfile(depth=1), qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        self._always = [(publisher(kind, topic), adapter) for topic, (kind, adapter) in ALWAYS.items()]
+        self._backbone, self._tip = publisher(Path, 'backbone'), publisher(PointStamped, 'tip')
         self._of_shapes = [(publisher(kind, topic), adapter) for topic, (kind, adapter) in OF_SHAPES.items()]
         self._markers = publisher(MarkerArray, 'markers')
         self._overlays = [publisher(Image, f'plane_{plane}/overlay') for plane in PLANES]
@@ -39,8 +38,8 @@ class Outputs:
     def answer(self, frame: Frame, result: Reconstruction) -> None:
         """Publish the shape of a result, if it has one."""
         if result.shape is not None:
-            for out, adapter in self._always:
-                out.publish(adapter(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
+            self._backbone.publish(shape_to_path_cdr(result.shape, frame.stamp_ns, frame.frame_id))
+            self._tip.publish(shape_to_tip(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
 
     def explain(self, job: Job, frame: Frame | None, result: Reconstruction) -> None:
         """Publish what else there is to say of a pair, of a rejected one too; `frame` is None where the messages were no frame."""

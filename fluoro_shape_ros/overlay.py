@@ -23,8 +23,11 @@ END_PX = 15.0           # an end of a centreline this near to the reprojected ti
 INSET = 0.25            # side of the magnified surroundings of the tip, share of the image's shorter side
 INSET_HALF = 8          # line widths from the tip to the inset's border
 NOISE_SPAN = 8          # from black to white, in median differences of neighbours: noise must not fill the range
+RING = 7                # line widths, the radius of the ring that shows where the tip is
 DASH = 6                # line widths, and as much to the next
 SHIFT = 4               # fractional bits of OpenCV's coordinates
+_TURN = np.linspace(0, 2 * np.pi, 65)
+_CIRCLE = np.c_[np.cos(_TURN), np.sin(_TURN)]
 
 
 @dataclass(frozen=True)
@@ -50,11 +53,12 @@ def overlay(image: np.ndarray, plane: int, result: Reconstruction, views: tuple[
         tip = distort(views[plane], project(views[plane].P, result.shape.points[-1:]))[0]
         if (np.abs(tip / (image.shape[1], image.shape[0]) - 0.5) < 0.5).all():      # in the image; NaN is not
             inset = magnified(canvas, strokes, tip, unit)
+            strokes.insert(0, Stroke('tip ring', tip + RING * unit * _CIRCLE, TIP))      # under the others
     draw(canvas, strokes, unit)
     title, *rest = words(result)
     colour = GOOD if result.outcome is Outcome.OK else REJECTED
     top = write(canvas, [(f'plane {"AB"[plane]}: {title}', colour), *((line, WORDS) for line in rest)])
-    bottom = caption(canvas, {s.name: s.colour for s in strokes})
+    bottom = caption(canvas, {s.name: s.colour for s in strokes if s.name != 'tip ring'})
     if inset is not None:
         _place(canvas[top:bottom], inset, np.vstack([s.points_px for s in strokes if s.name in ('seen', 'backbone')]) - (0, top))
     return canvas
@@ -103,8 +107,7 @@ def tip_ellipse(view: View, shape: Shape) -> np.ndarray | None:
     J = projection_jacobian(view.P, shape.tip[None])[0]
     variance, axes = np.linalg.eigh(J @ shape.covariance[-1] @ J.T)
     radii = np.sqrt(np.maximum(variance, 0.0) * chdtri(2, 1 - CONFIDENCE))
-    t = np.linspace(0, 2 * np.pi, 65)
-    return distort(view, project(view.P, shape.tip) + (np.c_[np.cos(t), np.sin(t)] * radii) @ axes.T)
+    return distort(view, project(view.P, shape.tip) + (_CIRCLE * radii) @ axes.T)
 
 
 def tip_lines(view: View, other: View, seen, shape: Shape | None) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from .config import Config, fields
+from .config import Config, constraint, fields
 
 _TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE, str: Parameter.Type.STRING}
 _FIELDS = {f.name: f for f in fields()}
@@ -31,12 +31,10 @@ def declare(node: Node) -> Config:
 
 
 def descriptor(f: dataclasses.Field) -> ParameterDescriptor:
-    """What ROS tools can know of a parameter: type, description with unit, range, choices."""
+    """What ROS tools can know of a parameter: type, description with unit, range, constraints."""
     m = f.metadata
     unit = f' ({m["unit"]})' if m['unit'] else ''
-    d = ParameterDescriptor(name=f.name, type=_type(f).value, description=m['description'] + unit)
-    if m['choices']:
-        d.additional_constraints = f'one of: {", ".join(m["choices"])}'
+    d = ParameterDescriptor(name=f.name, type=_type(f).value, description=m['description'] + unit, additional_constraints=constraint(f))
     if m['low'] is not None and _type(f) is Parameter.Type.DOUBLE:
         d.floating_point_range = [FloatingPointRange(from_value=m['low'], to_value=m['high'])]
     if m['low'] is not None and _type(f) is Parameter.Type.INTEGER:

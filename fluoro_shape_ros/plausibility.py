@@ -7,13 +7,15 @@ import numpy as np
 from .config import Config
 from .curve import curvature
 from .data import Outcome
-from .detect import LENIENT, evidence
+from .detect import evidence
 from .fit import Fit, contrast_ratio, shown
 
-MIN_LIKENESS = 0.86     # correlation of the profile seen with a cylinder's of robot_radius, in the worse plane
+MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
+WIDTH = (0.6, 1.25)     # how many times as wide as robot_radius it may look: that may be off by a third, and images are not equally sharp
 MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
+MAX_END_SIGMA, MAX_END_PX = 1.5e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see detect.evidence, for a length of 1 m
 
@@ -24,7 +26,9 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
     if length_px < config.detection.min_length_px:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
     if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
-        return Outcome.POORLY_EXPLAINED, f'its profile is not that of a device of robot_radius (likeness {f.likeness[0]:.2f}, {f.likeness[1]:.2f})'
+        return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
+    if not WIDTH[0] < f.width < WIDTH[1]:
+        return Outcome.POORLY_EXPLAINED, f'it looks {f.width:.1f} times as wide as a device of robot_radius'
     ratio = contrast_ratio(f)
     if ratio > MAX_CONTRAST_RATIO:
         return Outcome.DIRECTIONS_DISAGREE, f'one plane shows it {ratio:.1f} times as dark as the other'
@@ -32,11 +36,11 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
     for k, name in enumerate(('first', 'last')):
-        if not f.open_end[k] and f.beyond[k].max() > MAX_BEYOND:
+        if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * (f.s[1] - f.s[0]))):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
-    if evidence(f, LENIENT) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
+    if evidence(f) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
         return Outcome.POORLY_EXPLAINED, 'too little speaks for it being one device in both planes (likeness, darkness, ends)'
     return None
 

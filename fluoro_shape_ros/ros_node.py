@@ -27,7 +27,8 @@ from .data import Frame, Outcome, Reconstruction
 from .outputs import Outputs
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
-from .subscriptions import AdaptiveSubscription, transform_lookup
+from .subscriptions import AdaptiveSubscription, unheard
+from .transforms import TfMissing, TfPoses, import_tf
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
@@ -37,7 +38,7 @@ PATIENCE_S = 0.2        # for a camera info that should come with its image
 class FluoroShapeNode(Node):
     """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread reconstructs and publishes.
 
-    Raises ConfigError where a parameter given at the start can't work.
+    Raises ConfigError where a parameter given at the start can't work, and TfMissing where it asks for tf and there is none.
     """
 
     def __init__(self):
@@ -80,7 +81,7 @@ class FluoroShapeNode(Node):
             old.destroy()
         given = self._config.input
         if given.geometry == 'tf' and self._lookup is None:
-            self._lookup = transform_lookup(self)
+            self._lookup = TfPoses(self)
         # camera infos first: the executor takes them in this order, and an image needs its camera
         for plane in PLANES:
             self._inputs[f'camera info {plane}'] = AdaptiveSubscription(
@@ -107,6 +108,8 @@ class FluoroShapeNode(Node):
             self._forget()
             for book in self._books.values():
                 book.rewind(stamp)
+            if self._lookup is not None:
+                self._lookup.forget()
         if pair is not None:
             self._tally.event('pair')
             self._drop(self._held is not None)
@@ -193,8 +196,9 @@ class FluoroShapeNode(Node):
 
     def _on_check_parameters(self, parameters) -> SetParametersResult:
         try:
-            params.changed(self._config, parameters)
-        except ConfigError as error:
+            if params.changed(self._config, parameters).input.geometry == 'tf':
+                import_tf()
+        except (ConfigError, TfMissing) as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -245,7 +249,7 @@ class FluoroShapeNode(Node):
 
     def _statuses(self) -> list:
         gap = self._pairer.gap_ns
-        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None,
+        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, unheard=partial(unheard, self._inputs, plane),
                                     reliability='best_effort' if self._inputs[f'image {plane}'].best_effort else 'reliable',
                                     fell_back=self._inputs[f'image {plane}'].fell_back) for plane in PLANES]
         pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)

@@ -11,6 +11,7 @@ from .curve import arc_length, at_arc_length
 KNOT_SPACING = 0.008        # m: a device bends with radii of some cm
 MIN_CONTROL, MAX_CONTROL = 7, 48
 UNIFORM_CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6    # row p: coefficients of u^p of the four weights
+DERIVATIVE = np.diag([1.0, 2.0, 3.0], 1)        # of the powers of u
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,9 @@ class Spline3:
         x = (np.asarray(s, float) - self.start) / h
         k = np.clip(np.floor(x), 0, pieces - 1).astype(int)
         u = x - k
-        powers = np.stack([_falling(p, derivative) * u ** max(p - derivative, 0) for p in range(4)], axis=1) / h**derivative
-        return k, powers @ UNIFORM_CUBIC
+        u2 = u * u
+        powers = np.stack([np.ones_like(u), u, u2, u2 * u], axis=1)
+        return k, powers @ (np.linalg.matrix_power(DERIVATIVE / h, derivative) @ UNIFORM_CUBIC)
 
     def basis(self, s: np.ndarray) -> np.ndarray:
         """(N, n) basis functions at (N,) arc lengths."""
@@ -44,12 +46,7 @@ class Spline3:
     def __call__(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
         """(N, 3) points, or derivatives."""
         k, b = self.weights(s, derivative)
-        return np.einsum('ij,ijk->ik', b, self.control[k[:, None] + np.arange(4)])
-
-
-def _falling(p: int, d: int) -> float:
-    """p (p - 1) ... of d factors: the derivative's factor of u^p."""
-    return float(np.prod(np.arange(p - d + 1, p + 1))) if p >= d else 0.0
+        return (b[:, None] @ self.control[k[:, None] + np.arange(4)])[:, 0]
 
 
 def bending(n: int) -> np.ndarray:

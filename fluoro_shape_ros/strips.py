@@ -3,40 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from .data import View
-from .geometry import distort, project
+from .geometry import distort
 
 
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
+BLUR_PX = 1.0           # of an image, beside the device's own shape
+PIECE = 32              # strips
+WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
 
 
 @dataclass(frozen=True)
 class Strips:
-    """Profiles across the projected curve in one plane."""
+    """Profiles across a curve: in each of V planes (leading axis), or in one image (no leading axis)."""
 
-    centers_px: np.ndarray  # (N, 2) undistorted pixels
-    normals: np.ndarray     # (N, 2) unit, across the curve
-    speed: np.ndarray       # (N,) px per m of arc length: foreshortening shows here
-    profiles: np.ndarray    # (N, W) image values at offsets
+    centers_px: np.ndarray  # (V, N, 2) undistorted pixels
+    normals: np.ndarray     # (V, N, 2) unit, across the curve
+    speed: np.ndarray       # (V, N) px per m of arc length: foreshortening shows here
+    profiles: np.ndarray    # (V, N, W) image values at offsets
     offsets_px: np.ndarray  # (W,)
-    inside: np.ndarray      # (N,) bool: the whole strip lies in the exposed field
-    lit: np.ndarray         # (N,) bool: its middle does
+    inside: np.ndarray      # (V, N) bool: the whole strip lies in the exposed field
+    lit: np.ndarray         # (V, N) bool: its middle does
 
 
 @dataclass(frozen=True)
 class Measurement:
     """What each strip says."""
 
-    offset_px: np.ndarray   # (N,) of the device's centre along the normal
-    variance: np.ndarray    # (N,) of it, px^2
-    presence: np.ndarray    # (N,) 1: as dark as the device usually is, 0: nothing there
-    presence_sigma: float   # standard deviation of `presence` from noise
+    offset_px: np.ndarray       # (V, N) of the device's centre along the normal
+    variance: np.ndarray        # (V, N) of it, px^2
+    presence: np.ndarray        # (V, N) 1: as dark as the device usually is, 0: nothing there
+    presence_sigma: np.ndarray  # (V,) standard deviation of `presence` from noise
 
 
 def half_width_range(half_width_px: float) -> float:
@@ -44,115 +48,169 @@ def half_width_range(half_width_px: float) -> float:
     return float(np.ceil(1.6 * half_width_px + 5.0))
 
 
-def cut(image: np.ndarray, field: np.ndarray, view: View, points: np.ndarray, tangents: np.ndarray, reach_px: float) -> Strips:
-    """Strips of the (H, W) float32 image across the projections of (N, 3) points with (N, 3) tangents dX/ds, one a point."""
-    centers = project(view.P, points)
-    ahead = project(view.P, points + 1e-5 * tangents)
-    step = (ahead - centers) / 1e-5
-    speed = np.linalg.norm(step, axis=1)
-    tangent = step / np.maximum(speed, 1e-9)[:, None]
-    normals = np.c_[-tangent[:, 1], tangent[:, 0]]
-    return _sample(image, field, view, centers, normals, speed, reach_px)
+def cut(images, fields, views, points: np.ndarray, tangents: np.ndarray, reach_px: float) -> Strips:
+    """Strips of the (H, W) float32 images across the projections of (N, 3) points with (N, 3) tangents dX/ds, one a point and plane."""
+    P = np.stack([v.P for v in views])
+    x = points @ P[:, :, :3].transpose(0, 2, 1) + P[:, None, :, 3]
+    centers = x[..., :2] / x[..., 2:]
+    dx = tangents @ P[:, :, :3].transpose(0, 2, 1)
+    step = (dx[..., :2] - centers * dx[..., 2:]) / x[..., 2:]
+    speed = np.linalg.norm(step, axis=-1)
+    tangent = step / np.maximum(speed, 1e-9)[..., None]
+    normals = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    offsets = np.arange(-reach_px, reach_px + 1)
+    sampled = [_sample(*plane, offsets) for plane in zip(images, fields, views, centers, normals)]
+    profiles, inside, lit = (np.stack(part) for part in zip(*sampled))
+    return Strips(centers, normals, speed, profiles, offsets, inside, lit)
 
 
-def cut_along(image: np.ndarray, field: np.ndarray, points_px: np.ndarray, reach_px: float) -> Strips:
-    """Strips across an (N, 2) line of image pixels about a pixel apart, at every third."""
-    smooth = uniform_filter1d(points_px, 9, axis=0, mode='nearest')
-    tangent = np.gradient(smooth, axis=0)[::3]
+def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], reach_px: float) -> tuple[Strips, np.ndarray]:
+    """Strips across (N, 2) lines of image pixels about a pixel apart, at every third; and of which line each strip is."""
+    smooth = [uniform_filter1d(line, 9, axis=0, mode='nearest') for line in lines_px]
+    tangent = np.concatenate([np.gradient(line, axis=0)[::3] for line in smooth])
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
-    centers = smooth[::3]
-    return _sample(image, field, None, centers, np.c_[-tangent[:, 1], tangent[:, 0]], np.ones(len(centers)), reach_px)
+    centers, normals = np.concatenate([line[::3] for line in smooth]), np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    offsets = np.arange(-reach_px, reach_px + 1)
+    profiles, inside, lit = _sample(image, field, None, centers, normals, offsets)
+    return Strips(centers, normals, np.ones(len(centers)), profiles, offsets, inside, lit), np.repeat(np.arange(len(smooth)), [len(x[::3]) for x in smooth])
 
 
-def _sample(image, field, view: View | None, centers, normals, speed, reach_px: float) -> Strips:
-    x = np.arange(-reach_px, reach_px + 1)
-    at = centers[:, None] + x[None, :, None] * normals[:, None]
+def _sample(image, field, view: View | None, centers, normals, offsets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N, W) values, (N,) whether the whole strip lies in the field and (N,) whether its middle does."""
+    at = centers[:, None] + offsets[:, None] * normals[:, None]
     if view is not None and view.distortion is not None:
         at = distort(view, at.reshape(-1, 2)).reshape(at.shape)
-    at = at.astype(np.float32)
-    profiles = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    ends = [0, len(x) // 2, -1]
-    exposed = cv2.remap(field, at[:, ends, 0], at[:, ends, 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return Strips(centers, normals, speed, profiles, x, (exposed > 0).all(axis=1), exposed[:, 1] > 0)
+    u, v = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+    profiles = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    ends = [0, len(offsets) // 2, -1]
+    exposed = cv2.remap(field, u[:, ends], v[:, ends], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    return profiles, exposed.all(axis=1), exposed[:, 1]
 
 
-def likeness(profile: np.ndarray, half_width_px: float) -> float:
-    """Correlation of a (W,) profile, one sample a px about its middle, with a cylinder's shadow; a smooth background (parabola) taken off both."""
-    x = np.arange(len(profile)) - len(profile) // 2
-    M = np.vander(x / x[-1], 3)
-    a, b = (p - M @ np.linalg.lstsq(M, p, rcond=None)[0] for p in (-profile, shadow(half_width_px, x)))
-    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-12))
+def likeness(profiles: np.ndarray, half_width_px: float) -> np.ndarray:
+    """(..., K) correlation of (..., W) profiles, one sample a px about their middles, with the shadows of cylinders WIDTHS times as wide.
+
+    A smooth background (parabola) is taken off both.
+    """
+    basis, shadows = _cylinders(round(100 * half_width_px), profiles.shape[-1])
+    a = profiles @ basis @ basis.T - profiles
+    return a @ shadows.T / (np.linalg.norm(a, axis=-1, keepdims=True) + 1e-12)
 
 
-def mean_profile(strips: Strips, good: np.ndarray) -> np.ndarray:
-    """(W,) median profile of the good strips inside the field; all equal where there are none."""
-    rows = strips.profiles[good & strips.inside]
-    return np.median(rows, axis=0) if len(rows) else np.ones(len(strips.offsets_px))
+@lru_cache(256)
+def _cylinders(half_width_cpx: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(W, 3) orthonormal parabolas, and (K, W) shadows without them, of unit norm."""
+    x = np.arange(count) - count // 2
+    basis, _ = np.linalg.qr(np.vander(x / x[-1], 3))
+    shadows = np.stack([shadow(half_width_cpx / 100 * k, x) for k in WIDTHS])
+    shadows -= shadows @ basis @ basis.T
+    return basis, shadows / np.linalg.norm(shadows, axis=1, keepdims=True)
 
 
-def shadow(half_width_px: float, offsets_px: np.ndarray, blur_px: float = 1.0) -> np.ndarray:
-    """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred."""
-    fine = np.arange(offsets_px[0] - 4, offsets_px[-1] + 4 + 1e-9, 0.125)
-    chord = np.sqrt(np.maximum(half_width_px**2 - fine**2, 0))
-    kernel = np.exp(-0.5 * (np.arange(-32, 33) * 0.125 / blur_px) ** 2)
+def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np.ndarray]:
+    """How many times as wide as expected a device looks, the same in all V planes, and the (V,) likeness of each with a cylinder so wide.
+
+    profiles: (B, W) of its pieces in each plane. The median piece counts: some may run along another edge.
+    """
+    alike = np.stack([np.median(likeness(p, h), axis=0) if len(p) else np.zeros(len(WIDTHS)) for p, h in zip(profiles, half_width_px)])
+    best = int(alike.min(axis=0).argmax())
+    return float(WIDTHS[best]), alike[:, best]
+
+
+def pieces(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """(B, W) medians of successive PIECE good ones among (N, W) profiles; one of all where there are fewer."""
+    profiles = profiles[good]
+    if len(profiles) < PIECE:
+        return np.median(profiles, axis=0, keepdims=True) if len(profiles) else profiles
+    return np.median(profiles[:len(profiles) // PIECE * PIECE].reshape(-1, PIECE, profiles.shape[1]), axis=1)
+
+
+def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """(W,) median of the good ones among (N, W) profiles; all equal where there are none."""
+    return np.median(profiles[good], axis=0) if good.any() else np.ones(profiles.shape[-1])
+
+
+def shadow(half_width_px: float, offsets_px: np.ndarray) -> np.ndarray:
+    """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred. h counts in hundredths of a px."""
+    return np.interp(offsets_px, *_shadow(round(100 * half_width_px)), 0.0, 0.0)
+
+
+@lru_cache(1024)
+def _shadow(half_width_cpx: int) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets in px, 0.125 apart, and the blurred chord there."""
+    reach = half_width_cpx / 100 + 5 * BLUR_PX
+    x = np.arange(-np.ceil(reach), np.ceil(reach) + 1e-9, 0.125)
+    chord = np.sqrt(np.maximum((half_width_cpx / 100) ** 2 - x**2, 0))
+    kernel = np.exp(-0.5 * (np.arange(-32, 33) * 0.125 / BLUR_PX) ** 2)
     blurred = np.convolve(chord, kernel / kernel.sum(), mode='same')
-    return np.interp(offsets_px, fine, blurred / blurred.max())
+    return x, blurred / blurred.max()
 
 
-def own_shadow(strips: Strips, good: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(W,) the device's mean profile over the `good` strips, made symmetric, unit depth; the `expected` one where there is too little of it."""
+def own_shadow(profiles: np.ndarray, offsets_px: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """(W,) the device's mean over the `good` ones of (N, W) profiles, made symmetric, unit depth; the `expected` one where there is too little of it."""
     if good.sum() < 20:
         return expected
-    x = strips.offsets_px
-    mean = np.median(strips.profiles[good][::2], axis=0)
+    mean = np.median(profiles[good][::2], axis=0)
     outer = expected < 0.02
-    base = np.polyval(np.polyfit(x[outer], mean[outer], 1), x) if outer.sum() > 3 else mean.max()
-    dark = base - mean
+    dark = _line(offsets_px, mean, outer) - mean if outer.sum() > 3 else mean.max() - mean
     dark = 0.5 * (dark + dark[::-1])
     dark[outer] = 0
     return dark / dark.max() if dark.max() > 0 and expected @ dark > 0.7 * np.linalg.norm(expected) * np.linalg.norm(dark) else expected
 
 
-def measure(strips: Strips, profile: np.ndarray, reference: np.ndarray | None = None) -> Measurement:
-    """Least squares of each strip for background (parabola), darkness and shift of `profile`: I = b0 + b1 x + b2 x^2 - c (T(x) - d T'(x)).
+def _line(x: np.ndarray, y: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """The straight line through the (x, y) `where`, at all x."""
+    dx, dy = x - x[where].mean(), y - y[where].mean()
+    return y[where].mean() + (dx[where] @ dy[where]) / (dx[where] @ dx[where]) * dx
+
+
+def measure(strips: Strips, shadows: np.ndarray, reference: np.ndarray | None = None) -> Measurement:
+    """Least squares of each strip for background (parabola), darkness and shift of its plane's profile T, a row of `shadows` (V, W):
+    I = b0 + b1 x + b2 x^2 - c (T(x) - d T'(x)).
 
     `reference` (N,) bool: the strips whose darkness counts as usual; all by default.
     """
+    width = len(strips.offsets_px)
     x = strips.offsets_px / strips.offsets_px[-1]
-    M = np.stack([np.ones_like(x), x, x**2, profile, np.gradient(profile)], axis=1)
-    fit = np.linalg.pinv(M)
-    coefficients = strips.profiles @ fit.T
-    rest = strips.profiles - coefficients @ M.T
-    noise = 1.4826 * np.median(np.abs(rest)) * np.sqrt(len(x) / (len(x) - 5)) + 1e-9
+    M = np.stack([*np.broadcast_to(np.stack([np.ones_like(x), x, x**2])[:, None], (3, *shadows.shape)), shadows, np.gradient(shadows, axis=1)], axis=2)
+    fit = np.linalg.pinv(M)                                                     # (V, 5, W)
+    coefficients = strips.profiles @ fit.transpose(0, 2, 1)
+    rest = strips.profiles - coefficients @ M.transpose(0, 2, 1)
+    noise = 1.4826 * np.median(np.abs(rest[:, ::2]).reshape(len(rest), -1), axis=1)[:, None] * np.sqrt(width / (width - 5)) + 1e-9
     inside = strips.inside
-    darkness = np.where(inside, -coefficients[:, 3], np.nan)
-    usual = _running_median(darkness, inside if reference is None else inside & reference)
+    darkness = np.where(inside, -coefficients[..., 3], np.nan)
+    usual = np.stack([_running_median(d, i if reference is None else i & reference) for d, i in zip(darkness, inside)])
     usual = np.where(usual > 1e-9, usual, np.nan)       # no darkness at all, or brighter than its surroundings: no device to measure
-    offset = coefficients[:, 4] / usual
-    variance = np.nan_to_num(noise**2 * (fit[4] @ fit[4]) / usual**2, nan=np.inf)
+    offset = coefficients[..., 4] / usual
+    gain = np.linalg.norm(fit, axis=2)
+    variance = np.nan_to_num((noise * gain[:, 4:]) ** 2 / usual**2, nan=np.inf)
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
-    misfit = uniform_filter1d(np.minimum((rest**2).sum(axis=1) / (len(x) - 5), 9 * noise**2), TOGETHER) / noise**2
+    square = rest**2
+    limit = 9 * noise**2
+    misfit = uniform_filter1d(np.minimum(square.sum(axis=2) / (width - 5), limit), TOGETHER, axis=1) / noise**2
     variance = variance * (1 + TOGETHER * np.maximum(misfit - MISFIT, 0))
-    odd = np.minimum(rest**2, 9 * noise**2).mean(axis=1) > 3.5 * noise**2   # another edge runs through: not to be trusted
+    odd = np.minimum(square, limit[..., None]).mean(axis=2) > 3.5 * noise**2    # another edge runs through: not to be trusted
     variance = np.where(inside & ~odd, variance, np.inf)
-    sigma = noise * np.linalg.norm(fit[3]) / np.nanmedian(usual) if np.isfinite(usual).any() else np.inf
-    return Measurement(np.nan_to_num(offset), variance, np.where(inside, darkness / usual, np.nan), float(sigma))
+    sigma = np.array([n * g / np.nanmedian(u) if np.isfinite(u).any() else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
+    return Measurement(np.nan_to_num(offset), variance, np.where(inside, darkness / usual, np.nan), sigma)
 
 
-def search(strips: Strips, profile: np.ndarray, smooth: int = 9) -> Measurement:
-    """Where the darkest line that fits `profile` (narrower than the strips) lies in each, averaged over `smooth` strips: a start within a few px.
+def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
+    """Where the darkest line that fits its plane's profile, a row of `shadows` (V, w), narrower than the strips, lies in each, averaged over `smooth` strips.
 
     Worth about a pixel; worth nothing where the line found is much fainter or darker than it usually is: there something hides the device.
     """
-    half = (len(profile) - 1) // 2
-    kernel = profile - profile.mean()
-    response = -cv2.filter2D(strips.profiles, cv2.CV_32F, kernel[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
-    response = cv2.blur(response, (1, smooth))[:, half // 2: -(half // 2) or None]
-    x = strips.offsets_px[half // 2: -(half // 2) or None]
-    best = np.argmax(response, axis=1)
-    strength = response[np.arange(len(best)), best] / max(float(np.median(response.max(axis=1)[strips.inside])) if strips.inside.any() else 1.0, 1e-9)
+    half = (shadows.shape[1] - 1) // 2
+    middle = slice(half // 2, -(half // 2) or None)
+    kernels = (shadows - shadows.mean(axis=1, keepdims=True)).astype(np.float32)
+    response = np.stack([cv2.blur(-cv2.filter2D(p, cv2.CV_32F, k[None], borderType=cv2.BORDER_REPLICATE), (1, smooth))[:, middle]
+                         for p, k in zip(strips.profiles, kernels)])
+    best = np.argmax(response, axis=2)
+    darkest = np.take_along_axis(response, best[..., None], axis=2)[..., 0]
+    usual = [max(float(np.median(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)]
+    strength = darkest / np.array(usual)[:, None]
     believed = strips.inside & (strength > 0.4) & (strength < 2.5)
-    return Measurement(x[best], np.where(believed, 1.0, np.inf), strength, 1.0)
+    return Measurement(strips.offsets_px[middle][best], np.where(believed, 1.0, np.inf), strength, np.ones(len(strength)))
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:

@@ -1,19 +1,14 @@
-"""What the node listens to: subscriptions that take what a publisher offers, and poses from tf."""
+"""What the node listens to: subscriptions that take what a publisher offers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
-from rclpy.time import Time
-from scipy.spatial.transform import Rotation
-
-from .worker import Lookup, NoTransform
 
 RELIABILITIES = ('auto', 'reliable', 'best_effort')
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
@@ -42,6 +37,16 @@ class AdaptiveSubscription:
     def fell_back(self) -> bool:
         """Whether best-effort is in use because of a publisher, not because anybody wanted it."""
         return self._auto and self.best_effort
+
+    @property
+    def topic(self) -> str:
+        """The full name, remapped."""
+        return self._subscription.topic_name
+
+    @property
+    def publishers(self) -> int:
+        """How many there are, compatible or not."""
+        return self._node.count_publishers(self.topic)
 
     def destroy(self) -> None:
         self._node.destroy_subscription(self._subscription)
@@ -82,28 +87,6 @@ def _reliability(node: Node, topic: str, image_reliability: str) -> str:
     return image_reliability if value == 'auto' else value
 
 
-def transform_lookup(node: Node) -> Lookup:
-    """A function (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples, from tf2.
-
-    It raises NoTransform, also where tf2_ros is not installed.
-    """
-    try:
-        import tf2_ros
-    except ImportError as error:
-        missing = f'geometry:=tf needs tf2_ros, which is not installed here ({error})'
-
-        def unknown(reference: str, camera: str, stamp_ns: int):
-            raise NoTransform(missing)
-        return unknown
-    buffer = tf2_ros.Buffer()
-    buffer.listener = tf2_ros.TransformListener(buffer, node)   # lives as long as the buffer
-
-    def lookup(reference: str, camera: str, stamp_ns: int):
-        try:
-            t = buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns)).transform
-        except tf2_ros.TransformException as error:
-            raise NoTransform(f'{camera} from {reference}: {error}') from error
-        q, p = t.rotation, t.translation
-        R = Rotation.from_quat(np.array([q.x, q.y, q.z, q.w])).as_matrix()
-        return tuple(map(tuple, R.tolist())), (p.x, p.y, p.z)
-    return lookup
+def unheard(subscriptions: dict[str, AdaptiveSubscription], plane: str) -> str:
+    """The topics of a plane that nobody publishes, in words; empty where all are published."""
+    return ' and '.join(s.topic for s in (subscriptions[f'image {plane}'], subscriptions[f'camera info {plane}']) if not s.publishers)

@@ -11,6 +11,7 @@ import numpy as np
 from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
 from msg_adapters.diagnostics import Tally
 from msg_adapters.images import BadImage, compressed_to_array, image_to_array
+from msg_adapters.messages import stamp_ns
 
 from .config import Config
 from .data import Frame, Outcome, Prior, Reconstruction, Shape, View
@@ -110,7 +111,7 @@ def adapt(job: Job, view_of: ViewOf, lookup: Lookup, tally: Tally) -> Frame | Re
         return Reconstruction(Outcome.NO_CAMERA_INFO, f'{" and ".join(missing)}: no valid camera info yet')
     given = job.config.input
     try:
-        poses = [lookup(job.frame_id, c.msg.header.frame_id, job.stamp_ns) if given.geometry == 'tf' else None for c in job.cameras]
+        poses = [lookup(job.frame_id, c.msg.header.frame_id, stamp_ns(image)) if given.geometry == 'tf' else None for c, image in zip(job.cameras, job.images)]
         views = tuple(view_of(c, plane, image.shape, given.rectified, pose) for c, plane, image, pose in zip(job.cameras, PLANES, images, poses))
     except NoTransform as error:
         return Reconstruction(Outcome.NO_TRANSFORM, str(error))

@@ -29,7 +29,7 @@ def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectifi
         K, P = _matrix(msg.k, 'K', (3, 3)), _matrix(msg.p, 'P', (3, 4))
         distortion = None if rectified else _distortion(msg, to_image @ K)
         if pose is not None:
-            P = P[:, :3] @ np.c_[pose[0], pose[1]]
+            P = _intrinsics(P[:, :3]) @ np.c_[pose[0], pose[1]]
     except BadCameraInfo as error:
         raise BadCameraInfo(f'plane {name}: {error}') from None
     try:
@@ -67,6 +67,13 @@ def _matrix(values, name: str, shape: tuple[int, int]) -> np.ndarray:
         raise BadCameraInfo(f'{name} is zero: the camera is not calibrated')
     if abs(np.linalg.det(m[:, :3] / np.abs(m[:, :3]).max(initial=1e-300))) < 1e-12:
         raise BadCameraInfo(f'{name} is singular')
+    return m
+
+
+def _intrinsics(m: np.ndarray) -> np.ndarray:
+    """The left 3x3 of a P whose pose is known from elsewhere."""
+    if np.abs(m[np.tril_indices(3, -1)]).max() > 1e-6 * np.abs(m).max():
+        raise BadCameraInfo('P\'s left 3x3 holds a rotation; where the pose comes from tf it must be the intrinsics alone, upper triangular')
     return m
 
 

@@ -9,6 +9,7 @@ import statistics
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fluoro_shape_ros.data import Outcome, Reconstruction
@@ -45,6 +46,7 @@ class PlaneSummary:
     camera_fault: str = ''          # the same for the last camera info
     reliability: str = 'reliable'   # in use
     fell_back: bool = False         # best-effort only because that is all a publisher offers
+    unheard: Callable[[], str] = str    # names those of its topics that nobody publishes; asked only where it matters
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class PairingSummary:
     slop_s: float
     rate_hz: float = 0.0
     dropped: int = 0                # complete pairs overtaken by a newer one before their turn
+    dropped_hz: float = 0.0
     silent_s: float | None = None   # since the last pair; None: there was none yet
     gap_s: float | None = None      # newest stamp of plane B less that of plane A
     both_alive: bool = False        # images come in both planes
@@ -83,11 +86,11 @@ def plane_status(s: PlaneSummary) -> Status:
         level, holds = (WARN, ', the one before holds') if s.has_camera else (ERROR, '')
         message = f'camera info refused{holds}: {s.camera_fault}'
     elif s.silent_s is None:
-        level, message = STALE, 'no image yet'
+        level, message = STALE, f'no image yet{_nobody(s)}'
     elif s.silent_s > WINDOW_S:
-        level, message = STALE, f'no image for {s.silent_s:.0f} s'
+        level, message = STALE, f'no image for {s.silent_s:.0f} s{_nobody(s)}'
     elif not s.has_camera:
-        level, message = ERROR, 'no camera info yet'
+        level, message = ERROR, f'no camera info yet{_nobody(s)}'
     elif s.fell_back:
         level, message = WARN, 'best-effort is all the publisher offers: images may get lost'
     else:
@@ -95,6 +98,11 @@ def plane_status(s: PlaneSummary) -> Status:
     return Status(f'plane {s.plane}', level, message, {
         'images': s.images, 'rate (1/s)': f'{s.rate_hz:.1f}', 'bad images': s.bad_images, 'bad camera infos': s.bad_camera_infos,
         'camera info': 'known' if s.has_camera else 'none', 'reliability': s.reliability})
+
+
+def _nobody(s: PlaneSummary) -> str:
+    topics = s.unheard()
+    return f': nobody publishes {topics}' if topics else ''
 
 
 def pairing_status(s: PairingSummary) -> Status:
@@ -110,7 +118,7 @@ def pairing_status(s: PairingSummary) -> Status:
     elif quiet:
         level, message = STALE, 'no pair yet' if s.silent_s is None else f'no pair for {s.silent_s:.0f} s'
     else:
-        level, message = OK, f'{s.rate_hz:.1f} pairs/s'
+        level, message = OK, f'{s.rate_hz:.1f} pairs/s' + (f', {s.dropped_hz:.1f} of them dropped: they come faster than they are processed' if s.dropped_hz else '')
     return Status('pairing', level, message, {
         'pairs': c.pairs, 'rate (1/s)': f'{s.rate_hz:.1f}', 'dropped': s.dropped, 'unpaired': c.unpaired, 'out of order': c.out_of_order,
         'duplicates': c.duplicates, 'unstamped': c.unstamped, 'jumps back': c.jumps})
@@ -121,6 +129,7 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
     last = 'none' if s.outcome is None else s.outcome.value
     reason = last if s.detail in ('', last) else f'{last}: {s.detail}'
     notes = (*s.warnings, *s.notes)
+    ms = [1e3 * x for x in s.latency_s]
     if not s.enabled:
         level, message = WARN, 'paused by ~/enable'
     elif s.capturing:
@@ -134,8 +143,7 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
     elif notes:
         level, message = WARN, '; '.join(notes)
     else:
-        level, message = OK, f'{s.rate_hz:.1f} results/s'
-    ms = [1e3 * x for x in s.latency_s]
+        level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images' if ms else '')
     values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask,
               'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
     return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
@@ -215,7 +223,7 @@ class Tally:
                             bad_camera_infos=self.count(f'bad {camera}'), camera_fault=self.reason(camera), **known)
 
     def pairing(self, counts: Counts, **known) -> PairingSummary:
-        return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), silent_s=self.silent_s('pair'),
+        return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), dropped_hz=self.rate_hz('dropped'), silent_s=self.silent_s('pair'),
                               both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'),
                               jumped=self.lately('jump'), **known)
 

@@ -6,6 +6,7 @@ scaled or cut to 8 bits.
 
 from __future__ import annotations
 
+import struct
 import sys
 from dataclasses import dataclass
 
@@ -36,6 +37,7 @@ ENCODINGS = {
     'bgr8': _Encoding(_U8, 3, cv2.COLOR_BGR2GRAY),
     'rgb8': _Encoding(_U8, 3, cv2.COLOR_RGB2GRAY),
 }
+MAX_PIXELS = 2**26     # of a compressed image: 8192x8192; a small file may say it is of any size
 _WRITTEN_AS = {(_U8, 2): 'mono8', (_U16, 2): 'mono16', (_F32, 2): '32FC1', (_U8, 3): 'bgr8'}     # by dtype and number of dimensions
 
 
@@ -81,19 +83,46 @@ def _checked(array: np.ndarray) -> np.ndarray:
 
 
 def compressed_to_array(msg) -> np.ndarray:
-    """(H, W) uint8, uint16 or float32 from a sensor_msgs/CompressedImage: whatever OpenCV decodes, JPEG, PNG and 16-bit PNG among it; colour becomes grey.
+    """(H, W) uint8 or uint16 from a sensor_msgs/CompressedImage that holds a PNG (8 or 16 bits) or a JPEG; colour becomes grey.
 
-    Raises BadImage where the data is no image.
+    The data says what it is; `format` ("png", "mono16; png compressed mono16", ...) is not believed. Raises BadImage for any other data, for
+    what can't be decoded or is cut short, and, before decoding it, for what says that it has more than MAX_PIXELS.
     """
-    if len(msg.data) == 0:
-        raise BadImage('the compressed image has no data')
     try:
-        array = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        data = np.frombuffer(msg.data, np.uint8)
+        width, height = _announced_size(data)
+        if width * height > MAX_PIXELS:
+            raise BadImage(f'says it is {width}x{height} pixels, more than any X-ray detector has')
+        array = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        if array is None:
+            raise BadImage('can\'t be decoded')
     except cv2.error as error:
-        raise BadImage(f'the compressed image ("{msg.format}") can\'t be decoded: {error.err}') from error
-    if array is None:
-        raise BadImage(f'the compressed image ("{msg.format}", {len(msg.data)} bytes) can\'t be decoded')
+        raise BadImage(f'{_name(msg)} can\'t be decoded: {error.err}') from error
+    except BadImage as error:
+        raise BadImage(f'{_name(msg)} {error}') from None
     return grey(array)
+
+
+def _name(msg) -> str:
+    return f'the compressed image (format "{msg.format[:60]}", {len(msg.data)} bytes)'
+
+
+def _announced_size(data: np.ndarray) -> tuple[int, int]:
+    """Width and height in the header of a PNG (ISO/IEC 15948, 11.2.2) or JPEG (ITU-T T.81, B.2.2); without decoding it."""
+    if data[:8].tobytes() == b'\x89PNG\r\n\x1a\n' and len(data) >= 24:
+        return struct.unpack('>II', data[16:24])
+    if data[:3].tobytes() != b'\xff\xd8\xff':
+        raise BadImage('is neither PNG nor JPEG')
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xff:
+        marker, length = struct.unpack('>BH', data[at + 1:at + 4])
+        if 0xc0 <= marker <= 0xcf and marker not in (0xc4, 0xc8, 0xcc):     # start of frame
+            if data[at:].tobytes().rfind(b'\xff\xd9') < 0:      # end of image: without it, OpenCV 4 fills what is missing with grey
+                raise BadImage('is cut short')
+            height, width = struct.unpack('>HH', data[at + 5:at + 9])
+            return width, height
+        at += 1 if marker == 0xff else 2 + length
+    raise BadImage('has no complete JPEG header')
 
 
 def grey(array: np.ndarray) -> np.ndarray:

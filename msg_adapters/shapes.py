@@ -5,6 +5,7 @@ Everything is in the reference frame, in metres; `new` is a factory (see message
 
 from __future__ import annotations
 
+import struct
 import sys
 
 import numpy as np
@@ -31,6 +32,22 @@ def shape_to_path(shape: Shape, stamp_ns: int, frame_id: str, new: New):
     poses = [new('geometry_msgs/msg/PoseStamped', header=head, pose=_pose(p, q, new))
              for p, q in zip(shape.points.tolist(), orientations(shape).tolist(), strict=True)]
     return new('nav_msgs/msg/Path', header=head, poses=poses)
+
+
+def shape_to_path_cdr(shape: Shape, stamp_ns: int, frame_id: str) -> bytes:
+    """What `shape_to_path` makes as ROS 2 serialises it (XCDR version 1, little endian; OMG DDS-XTypes 7.4), for a publisher that takes it as it is.
+
+    A hundred poses as Python objects cost several ms to make and to serialise, this a tenth of one.
+    """
+    name = frame_id.encode() + b'\0'
+    head = struct.pack('<iII', *divmod(int(stamp_ns), 10**9), len(name)) + name
+    start = head + bytes(-len(head) % 4) + struct.pack('<I', len(shape.points)) + head      # up to the first pose
+    start += bytes(-len(start) % 8)
+    head += bytes(-len(head) % 8)       # of the others: after a pose everything is aligned
+    rows = np.empty((len(shape.points), len(head) + 7 * 8), np.uint8)
+    rows[:, :len(head)] = np.frombuffer(head, np.uint8)
+    rows[:, len(head):] = np.ascontiguousarray(np.c_[shape.points, orientations(shape)], '<f8').view(np.uint8)
+    return b'\0\1\0\0' + start + rows.tobytes()[len(head):]
 
 
 def shape_to_tip(shape: Shape, stamp_ns: int, frame_id: str, new: New):
@@ -84,13 +101,13 @@ def orientations(shape: Shape) -> np.ndarray:
     # q_i = r_i r_(i-1) ... r_0: all prefix products in log2(N) rounds, each doubling how many factors are in
     step = 1
     while step < len(t):
-        turns[step:] = _products(turns[step:], turns[:-step])
+        turns[step:] = _product(turns[step:], turns[:-step])
         step *= 2
     return turns / np.linalg.norm(turns, axis=1, keepdims=True)
 
 
 def _smallest_rotations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, 4) unit quaternions x, y, z, w of the rotations by the smallest angle that turn the unit vectors a (N, 3) into b (N, 3)."""
+    """(N, 4) unit quaternions of the rotations by the smallest angle that turn the unit vectors a (N, 3) into b (N, 3)."""
     w = 1.0 + np.sum(a * b, axis=1)
     axis = np.cross(a, b)
     opposite = w < 1e-12    # half a turn about any axis across will do
@@ -99,10 +116,11 @@ def _smallest_rotations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
-def _products(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """(N, 4) quaternions p q, first q then p; scipy's Rotation takes a millisecond where this takes 20 microseconds."""
-    u, v, a, b = p[:, :3], q[:, :3], p[:, 3:], q[:, 3:]
-    return np.c_[a * v + b * u + np.cross(u, v), a * b - np.sum(u * v, axis=1, keepdims=True)]
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(N, 4) Hamilton products p q of quaternions x, y, z, w; scipy's Rotation, written for more than this, takes six times as long."""
+    (px, py, pz, pw), (qx, qy, qz, qw) = p.T, q.T
+    return np.stack([pw * qx + px * qw + py * qz - pz * qy, pw * qy - px * qz + py * qw + pz * qx,
+                     pw * qz + px * qy - py * qx + pz * qw, pw * qw - px * qx - py * qy - pz * qz], axis=1)
 
 
 def tip_covariance(shape: Shape) -> np.ndarray:

@@ -16,10 +16,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import Parameter as ParameterMsg
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
@@ -40,21 +40,40 @@ def curve():
 BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])     # so that the tip is no guess
 
 
-def projection(angle_deg, size=SIZE):
-    """(3, 4) P of a source 0.8 m from the origin that looks at it horizontally; 1 px is 1 mm there."""
+def intrinsics(size=SIZE):
+    """(3, 3) K of an image whose pixels are 1 mm at 0.8 m."""
+    return np.array([[800.0, 0, (size - 1) / 2], [0, 800.0, (size - 1) / 2], [0, 0, 1]])
+
+
+def pose(angle_deg):
+    """R, t of camera_from_reference of a source 0.8 m from the origin that looks at it horizontally."""
     a = np.deg2rad(angle_deg)
     forward = np.array([np.sin(a), np.cos(a), 0.0])
     right = np.cross(forward, [0, 0, 1.0])
-    K = np.array([[800.0, 0, (size - 1) / 2], [0, 800.0, (size - 1) / 2], [0, 0, 1]])
-    return K @ np.c_[np.stack([right, np.cross(forward, right), forward]), [0, 0, 0.8]]
+    return np.stack([right, np.cross(forward, right), forward]), np.array([0, 0, 0.8])
+
+
+def projection(angle_deg, size=SIZE):
+    """(3, 4) P at `pose`."""
+    return intrinsics(size) @ np.c_[pose(angle_deg)]
+
+
+def pose_at(plane, stamp_ns):
+    """`pose` of plane 'a' or 'b' of a C-arm that turns by 20 degrees a second."""
+    return pose(20 * stamp_ns / 1e9 + {'a': 0, 'b': 90}[plane])
 
 
 def draw(P, size=SIZE, device=True):
     """(size, size) uint8: a dark blurred line on a bright, even background."""
+    x = np.c_[curve(), np.ones(600)] @ P.T
+    return draw_pixels(x[:, :2] / x[:, 2:], size, device)
+
+
+def draw_pixels(points_px, size=SIZE, device=True):
+    """The same line through (N, 2) pixels."""
     image = np.full((size, size), 180, np.uint8)
     if device:
-        x = np.c_[curve(), np.ones(600)] @ P.T
-        cv2.polylines(image, [np.round(x[:, :2] / x[:, 2:] * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
+        cv2.polylines(image, [np.round(points_px * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
     return cv2.GaussianBlur(image, (5, 5), 0)
 
 
@@ -80,12 +99,12 @@ def image_msg(pixels, **fields):
 
 
 def png_msg(pixels):
-    return CompressedImage(format='png', data=bytes_of(cv2.imencode('.png', pixels)[1].tobytes()))
+    return CompressedImage(format='mono8; png compressed ', data=bytes_of(cv2.imencode('.png', pixels)[1].tobytes()))
 
 
 def info_msg(P, size=SIZE, **fields):
     """A CameraInfo with full P; `fields` override."""
-    values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5, k=[800.0, 0, size / 2, 0, 800.0, size / 2, 0, 0, 1],
+    values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5, k=intrinsics(size).ravel().tolist(),
                   r=np.eye(3).ravel().tolist(), p=P.ravel().tolist())
     return CameraInfo(**{**values, **fields})
 
@@ -98,9 +117,9 @@ def points(path):
 class NodeProcess:
     """fluoro_shape_node in a process of its own; ends with the block."""
 
-    def __init__(self, log, *parameters, code=None, domain=DOMAIN):
+    def __init__(self, log, *parameters, code=None, arguments=(), domain=DOMAIN):
         start = ['-m', 'fluoro_shape_ros.node'] if code is None else ['-c', code]
-        arguments = ['--ros-args', *(word for p in parameters for word in ('-p', p))]
+        arguments = ['--ros-args', *arguments, *(word for p in parameters for word in ('-p', p))]
         self._log = log
         self.process = subprocess.Popen([sys.executable, *start, *arguments], stdout=log.open('w'), stderr=subprocess.STDOUT,
                                         env={**os.environ, 'ROS_DOMAIN_ID': str(domain)})
@@ -228,7 +247,7 @@ class Client:
     def call(self, kind, name, request):
         client = self.node.create_client(kind, name)
         try:
-            assert client.wait_for_service(20)
+            assert client.wait_for_service(60)
             future = client.call_async(request)
             assert self.until(future.done)
             return future.result()
@@ -237,6 +256,11 @@ class Client:
 
     def trigger(self, name):
         return self.call(Trigger, f'/fluoro_shape/{name}', Trigger.Request())
+
+    def get(self, *names, node='/fluoro_shape'):
+        """The values of parameters."""
+        values = self.call(GetParameters, f'{node}/get_parameters', GetParameters.Request(names=names)).values
+        return [parameter_value_to_python(value) for value in values]
 
     def set(self, name, value=None, type_=None):
         """The result of setting a parameter."""

@@ -263,12 +263,32 @@ def test_bad_folders_are_named(real, tmp_path_factory):
         composites.load(tmp_path_factory.mktemp('empty'))
 
 
-def test_speed_is_printed_full_and_tracked(capsys):
-    assert bench.main(['speed', '--sizes', '512', '--scenes', '1', '--rounds', '1']) == 0
-    full, tracked = capsys.readouterr().out.splitlines()[1:]
-    assert 'spline, full' in full and 'detect' in full and 'spline, tracked' in tracked and 'track' in tracked
+def test_speed_is_printed_full_and_tracked_and_written(tmp_path, capsys):
+    file = tmp_path / 'speed.json'
+    assert bench.main(['speed', '--sizes', '1024', '--scenes', '2', '--rounds', '1', '--alone', '--json', str(file)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[7:24].strip() for line in lines[1:3]] == ['spline, full', 'spline, tracked']
+    assert any('spline, full: detect' in line for line in lines) and any('spline, tracked: track' in line for line in lines)
+    full, tracked = json.loads(file.read_text())['laps']
+    for laps in (full, tracked):
+        assert 0 < laps['right'] == len(laps['seconds']) <= 2 and len(laps['yardsticks']) == laps['right']
+        assert all(0 < sum(stages) for stages in laps['stages'].values())
+        assert_allclose(laps['median_y'], np.median(laps['seconds']) / np.median(laps['yardsticks']))
 
 
-def test_what_is_wrong_is_not_timed():
-    with pytest.raises(ToolError, match='paper.*(mm off|none of 1)'):
-        speed.times(speed.scenes(512, 1, 0), 'paper', False, 1)
+def test_growth_is_of_the_cost_per_pixel_in_yardsticks():
+    """Twice the width is four times the pixels: 8 Y instead of 2 Y is as much a pixel, whatever Y was just then; 16 Y is twice as much."""
+    small, same, more = (speed.Laps(size, speed.SPLINE, seconds=[s], yardsticks=[y], cpu=[s]) for size, s, y in ((512, 2.0, 1.0), (1024, 24.0, 3.0), (1024, 16.0, 1.0)))
+    found = [small, same, more]
+    assert_allclose([speed.growth(laps, found) for laps in found], [1, 1, 2])
+    assert_allclose(small.ns_per_pixel, 1e9 / 512**2)
+
+
+def test_what_is_wrong_is_not_timed(monkeypatch, capsys):
+    monkeypatch.setattr(speed, 'reconstruct', lambda frame, *_: Reconstruction(Outcome.NO_DEVICE_A))
+    monkeypatch.setattr(speed, 'sequences', lambda *_: [(case().scene,) * 2])
+    found = speed.measure(320, 1, 1, 0, compared=0)
+    assert [(laps.scenes, laps.right, laps.seconds) for laps in found] == [(1, 0, [])] * 2
+    assert 'nan' in speed.table(found + [speed.Laps(320, speed.PAPER, 1, 0, [1.0], [0.1], [1.0])])
+    assert bench.main(['speed', '--sizes', '320', '--scenes', '1', '--alone']) == 1
+    assert 'none of 1 scenes' in capsys.readouterr().err

@@ -79,6 +79,12 @@ def test_mono_calibration_needs_a_pose(info):
     assert_allclose(view(info(p=np.c_[K, [-50.0, 0, 0]]), pose=(np.eye(3), [0, 0, 1.0])).P, P)
 
 
+def test_a_pose_in_p_beside_the_one_given_is_refused(info):
+    turned = K @ np.c_[cv2.Rodrigues(np.array([0, 0.1, 0]))[0], [0, 0, 1.0]]
+    with pytest.raises(BadCameraInfo, match='plane a: .* holds a rotation'):
+        view(info(p=turned), pose=(np.eye(3), [0, 0, 1.0]))
+
+
 DISTORTIONS = {'plumb_bob': [-0.2, 0.05, 0.001, -0.002, 0.01], 'rational_polynomial': [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.001],
                'equidistant': [-0.05, 0.01, 0.002, -0.001]}
 

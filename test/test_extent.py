@@ -65,12 +65,18 @@ def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):
     return ndtr(z / blur_px) + np.random.default_rng(seed).normal(0, noise, z.shape)
 
 
+def placed(*arguments):
+    """m: where the device ends, and its standard deviation."""
+    end = locate(*arguments)
+    return end.at, end.honest_sigma(SPEED.mean())
+
+
 @pytest.mark.parametrize('outward', [1, -1])
 @pytest.mark.parametrize('blur_px', [0.8, 1.3, 2.0])
 @pytest.mark.parametrize('guess_px', [-8, 0.4, 8])
 def test_a_blurred_edge_is_found(outward, blur_px, guess_px):
     end = 100.37 * PX
-    at, sigma = locate(S, edge(end, outward, blur_px), np.full(2, 0.05), SPEED, end + guess_px * PX, outward, NONE)
+    at, sigma = placed(S, edge(end, outward, blur_px), np.full(2, 0.05), SPEED, end + guess_px * PX, outward, NONE)
     assert abs(at - end) < 0.1 * PX
     assert 0.05 * PX < sigma < 0.5 * PX
 
@@ -78,9 +84,9 @@ def test_a_blurred_edge_is_found(outward, blur_px, guess_px):
 def test_the_bulge_is_taken_off():
     beyond = np.array([2.0, 3.0]) * PX
     end = 100 * PX
-    at, sigma = locate(S, edge(end, beyond=beyond), np.full(2, 0.05), SPEED, end, 1, beyond)
+    at, sigma = placed(S, edge(end, beyond=beyond), np.full(2, 0.05), SPEED, end, 1, beyond)
     assert abs(at - end) < 0.1 * PX
-    assert sigma > locate(S, edge(end), np.full(2, 0.05), SPEED, end, 1, NONE)[1]       # and trusted less
+    assert sigma > placed(S, edge(end), np.full(2, 0.05), SPEED, end, 1, NONE)[1]       # and trusted less
 
 
 @pytest.mark.parametrize('noise', [0.2, 0.3])
@@ -88,7 +94,7 @@ def test_sigma_is_the_scatter_over_noise(noise):
     z, n = [], 120
     for seed in range(n):
         end = (90 + 0.173 * seed) * PX
-        at, sigma = locate(S, edge(end, noise=noise, seed=seed), np.full(2, noise), SPEED, end + (seed % 7 - 3) * PX, 1, NONE)
+        at, sigma = placed(S, edge(end, noise=noise, seed=seed), np.full(2, noise), SPEED, end + (seed % 7 - 3) * PX, 1, NONE)
         z.append((at - end) / sigma)
     # chi square with 120 degrees of freedom over 120: 1 +- 0.13; the floor of the model makes it less
     assert 0.5 < np.mean(np.square(z)) < 1.4
@@ -101,20 +107,20 @@ def test_one_plane_will_do_and_knows_less():
     both = edge(end)
     one = both.copy()
     one[:, 1] = np.nan
-    at, sigma = locate(S, one, np.full(2, 0.2), SPEED, end + PX, 1, NONE)
+    at, sigma = placed(S, one, np.full(2, 0.2), SPEED, end + PX, 1, NONE)
     assert abs(at - end) < 0.1 * PX
-    assert sigma > locate(S, both, np.full(2, 0.2), SPEED, end + PX, 1, NONE)[1]
+    assert sigma > placed(S, both, np.full(2, 0.2), SPEED, end + PX, 1, NONE)[1]
 
 
 def test_no_plane_leaves_the_guess_and_knows_nothing():
-    at, sigma = locate(S, np.full((200, 2), np.nan), np.full(2, 0.1), SPEED, 0.03, 1, NONE)
+    at, sigma = placed(S, np.full((200, 2), np.nan), np.full(2, 0.1), SPEED, 0.03, 1, NONE)
     assert at == 0.03 and sigma == np.inf
 
 
 @pytest.mark.parametrize('apart_px', [3, 6, 9])
 def test_planes_that_disagree_widen_sigma_by_half_their_difference(apart_px):
     ends = np.array([100, 100 + apart_px]) * PX
-    at, sigma = locate(S, edge(ends), np.full(2, 0.1), SPEED, ends.mean(), 1, NONE)
+    at, sigma = placed(S, edge(ends), np.full(2, 0.1), SPEED, ends.mean(), 1, NONE)
     assert ends[0] - PX < at < ends[1] + PX
     assert sigma > 0.4 * apart_px * PX
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from fluoro_shape_ros.curve import arc_length, at_arc_length
 from fluoro_shape_ros.field import field_of_view
 from fluoro_shape_ros.fit import fit, shown
+from fluoro_shape_ros.geometry import source
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.xray import Exposure
@@ -171,3 +172,15 @@ def test_depth_is_known_less_well_between_planes_that_nearly_agree(frame, truth)
 def test_nothing_is_fitted_where_both_fields_are_dark(frame, truth):
     images, _ = root(frame)
     assert fit(images, [np.zeros((512, 512), np.uint8)] * 2, VIEWS, truth, 0.0006) is None
+
+
+@pytest.mark.parametrize('start', ['at a source', 'behind it', 'out and back'])
+def test_nothing_is_fitted_from_a_start_that_no_device_can_have(frame, truth, start):
+    there = source(VIEWS[0].P)
+    if start == 'at a source':
+        points = there * 0.999 + 0.01 * (truth - truth.mean(axis=0))
+    elif start == 'behind it':
+        points = truth + 1.5 * there
+    else:
+        points = np.tile(np.concatenate([truth, truth[::-1]]), (20, 1))
+    assert fitted(frame, points) is None

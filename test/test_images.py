@@ -117,9 +117,12 @@ def test_no_message_is_made_of_what_no_encoding_can_hold(array, new):
         array_to_image(array, 1, '', new)
 
 
+def compressed_message(new, data, format_='png'):
+    return new('sensor_msgs/msg/CompressedImage', format=format_, data=np.frombuffer(data, np.uint8))
+
+
 def compressed(new, suffix, array):
-    data = cv2.imencode(suffix, array)[1]
-    return new('sensor_msgs/msg/CompressedImage', format=suffix[1:], data=data)
+    return compressed_message(new, cv2.imencode(suffix, array)[1], suffix[1:])
 
 
 def test_compressed_png_keeps_16_bits(new):
@@ -140,10 +143,53 @@ def test_compressed_colour_becomes_grey(new):
     assert got.tolist() == [[76] * 3] * 2
 
 
-@pytest.mark.parametrize('data', [b'', b'no image at all', b'\x89PNG\r\n\x1a\n', b'\xff\xd8\xff\xe0' + bytes(20)])
-def test_compressed_data_that_is_no_image_is_refused(new, data):
-    with pytest.raises(BadImage, match='compressed image'):
-        compressed_to_array(new('sensor_msgs/msg/CompressedImage', format='png', data=np.frombuffer(data, np.uint8)))
+@pytest.mark.parametrize('format_', ['png', 'mono16; png compressed mono16', '16UC1; png compressed ', 'mono16;png compressed', ''])
+def test_the_data_says_what_it_is_whatever_the_format_field_says(new, format_):
+    pixels = np.array([[0, 256, 65535], [1, 4095, 4096]], np.uint16)
+    got = compressed_to_array(compressed_message(new, cv2.imencode('.png', pixels)[1], format_))
+    assert got.dtype == np.uint16 and got.tolist() == pixels.tolist()
+
+
+@pytest.mark.parametrize('format_', ['jpeg', 'mono8; jpeg compressed bgr8', 'bgr8; jpeg compressed bgr8'])
+def test_a_colour_jpeg_of_a_grey_camera(new, format_):
+    pixels = np.full((16, 24, 3), 77, np.uint8)
+    got = compressed_to_array(compressed_message(new, cv2.imencode('.jpg', pixels)[1], format_))
+    assert got.shape == (16, 24) and got.dtype == np.uint8 and np.abs(got.astype(int) - 77).max() <= 1
+
+
+PNG = cv2.imencode('.png', np.arange(4096, dtype=np.uint16).reshape(64, 64))[1].tobytes()
+JPEG = cv2.imencode('.jpg', np.arange(4096).reshape(64, 64).astype(np.uint8))[1].tobytes()
+
+
+@pytest.mark.parametrize('data, says', [
+    (b'', 'neither PNG nor JPEG'),
+    (b'no image at all', 'neither PNG nor JPEG'),
+    (bytes(12) + PNG, 'neither PNG nor JPEG'),      # as compressedDepth sends it
+    (PNG[:8], 'neither PNG nor JPEG'),
+    (PNG[:60], 'decoded'),
+    (PNG[:-20], 'decoded'),
+    (PNG[:200] + bytes([PNG[200] ^ 255]) + PNG[201:], 'decoded'),
+    (b'\xff\xd8\xff\xe0' + bytes(20), 'no complete JPEG header'),
+    (JPEG[:len(JPEG) // 2], 'cut short'),
+    (JPEG[:-2], 'cut short'),
+    (b'II*\0' + bytes(100), 'neither PNG nor JPEG'),
+], ids=lambda value: value if isinstance(value, str) else f'{len(value)} bytes')
+def test_compressed_data_that_is_no_image_is_refused(new, data, says):
+    with pytest.raises(BadImage, match=f'compressed image .format "png", {len(data)} bytes.*{says}'):
+        compressed_to_array(compressed_message(new, data))
+
+
+@pytest.mark.parametrize('width, height', [(30000, 30000), (2**31 - 1, 2**31 - 1), (8193, 8192)])
+def test_a_small_file_that_says_it_is_huge_is_refused_before_it_is_decoded(new, monkeypatch, width, height):
+    monkeypatch.setattr(cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    png = PNG[:16] + struct.pack('>II', width, height) + PNG[24:]
+    with pytest.raises(BadImage, match=f'{width}x{height} pixels'):
+        compressed_to_array(compressed_message(new, png))
+    if width < 65536:
+        at = JPEG.index(b'\xff\xc0')
+        jpeg = JPEG[:at + 5] + struct.pack('>HH', height, width) + JPEG[at + 9:]
+        with pytest.raises(BadImage, match=f'{width}x{height} pixels'):
+            compressed_to_array(compressed_message(new, jpeg, 'jpeg'))
 
 
 def test_grey_drops_transparency_and_refuses_strange_pixels():

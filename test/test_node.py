@@ -1,5 +1,8 @@
 """The node on real topics."""
 
+import importlib.util
+
+import cv2
 import numpy as np
 import pytest
 
@@ -220,10 +223,42 @@ def test_a_bad_prediction_is_named(client):
     assert client.answer(client.send_pixels(GOOD))
 
 
+def test_16_bits_in_either_byte_order(client):
+    for big in (0, 1):
+        pair = [(pixels.astype(np.uint16) * 16).astype('>u2' if big else '<u2') for pixels in GOOD]     # 12 bits: the low byte alone says nothing
+        stamp = client.send([image_msg(pixels, encoding='mono16', is_bigendian=big, step=2 * SIZE) for pixels in pair])
+        path, _ = client.answer(stamp)
+        assert np.linalg.norm(points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < TOLERANCE
+
+
+def test_distortion_is_removed_unless_the_images_are_rectified(client):
+    """The image as received is some 8 px off P's, and bent; K and D tell."""
+    K, D = ros.intrinsics() + [[0, 0, 8], [0, 0, -6], [0, 0, 0]], np.array([-4.0, 0, 0.01, -0.01, 0])
+    infos, pair = [], []
+    for angle in (0, 90):
+        R, t = ros.pose(angle)
+        infos.append(info_msg(ros.projection(angle), k=K.ravel(), d=D))
+        pair.append(ros.draw_pixels(cv2.projectPoints(ros.curve(), cv2.Rodrigues(R)[0], t, K, D)[0][:, 0]))
+
+    def error():
+        path, _ = client.answer(client.send_pixels(pair, infos=infos))
+        return np.linalg.norm(points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max()
+    assert min(error() for _ in range(2)) < TOLERANCE      # where the machine is slow, the first pair may have come before its camera
+    assert client.set('rectified', True).successful
+    assert error() > 0.005
+    assert client.set('rectified', False).successful
+
+
+def jpeg_msg(pixels):
+    return ros.CompressedImage(format='mono8; jpeg compressed ', data=ros.bytes_of(cv2.imencode('.jpg', pixels)[1].tobytes()))
+
+
 def test_compressed_images(client):
     assert client.set('image_transport', 'compressed').successful
     with Client(compressed=True, start_ns=client.now_ns) as other:
         assert other.connected() and other.good()
+        assert other.answer(other.send([jpeg_msg(pixels) for pixels in GOOD]))
+        assert other.answer(other.send([ros.png_msg(pixels.astype(np.uint16) * 16) for pixels in GOOD]))
         other.send([ros.png_msg(GOOD[0]), ros.CompressedImage(format='png', data=[1, 2, 3])])
         assert other.hears('bad_image', 'plane b')
         client.now_ns = other.now_ns
@@ -231,12 +266,19 @@ def test_compressed_images(client):
     assert client.connected()
 
 
+@pytest.mark.skipif(importlib.util.find_spec('tf2_ros') is None, reason='tf2_ros is not installed')
 def test_a_pose_that_tf_does_not_know_is_named(client):
     assert client.set('geometry', 'tf').successful
     stamp = client.send_pixels(GOOD)
     assert client.hears('no_transform')
     assert client.set('geometry', 'camera_info').successful
     assert client.connected() and client.good() and stamp not in client.paths
+
+
+@pytest.mark.skipif(importlib.util.find_spec('tf2_ros') is not None, reason='tf2_ros is installed')
+def test_tf_is_refused_where_it_is_not_installed(client):
+    result = client.set('geometry', 'tf')
+    assert not result.successful and 'needs tf2_ros, which is not installed' in result.reason
 
 
 def test_a_best_effort_publisher_is_heard(node, stream):

@@ -1,15 +1,20 @@
 """The node's process: how it starts and ends, and what it survives."""
 
+import contextlib
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
 import ros_client as ros                        # noqa: E402
 from ros_client import BASE, Client, NodeProcess    # noqa: E402
+
+from fluoro_shape_ros.resources import resource_path    # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +69,62 @@ def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
         assert client.connected() and client.insist(lambda: client.paths), node.log
         assert client.value('reconstruction', 'count internal_error') == '2'
         assert node.log.count('Traceback') == 1 and 'IndexError' in node.log
+
+
+def test_poses_of_moving_planes_come_from_tf(log):
+    """tf2_ros, which PyPI does not have, is stood in for; its poses turn with the stamps."""
+    code = f"""if True:
+        import sys
+        from types import SimpleNamespace as Fields
+        sys.path.insert(0, {str(Path(ros.__file__).parent)!r})
+        import ros_client
+        from fluoro_shape_ros.node import main
+        from scipy.spatial.transform import Rotation
+        class Buffer:
+            known_to = 0
+            def clear(self):
+                self.known_to = 0
+            def lookup_transform(self, camera, reference, time, timeout):
+                assert reference == 'cell'
+                R, t = ros_client.pose_at(camera[len('plane_')], time.nanoseconds)
+                vector = lambda names, values: Fields(**dict(zip(names, values)))
+                if self.known_to > time.nanoseconds + 10**9:
+                    raise LookupError('the pose is too old')    # as tf has it until it is cleared
+                self.known_to = max(self.known_to, time.nanoseconds)
+                return Fields(transform=Fields(rotation=vector('xyzw', Rotation.from_matrix(R).as_quat()), translation=vector('xyz', t)))
+        sys.modules['tf2_ros'] = Fields(Buffer=Buffer, TransformListener=lambda buffer, node: node, TransformException=LookupError)
+        sys.exit(main())"""
+    parameters = ('geometry:=tf', 'reference_frame:=cell', BASE, ros.RADIUS)
+    with NodeProcess(log, *parameters, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+        infos = [ros.info_msg(np.c_[ros.intrinsics(), np.zeros(3)]) for _ in 'ab']
+        heard = lambda: any('no_device' in s.message for s in client.statuses)      # noqa: E731
+        assert client.connected() and client.insist(heard, pair=ros.BLANK, infos=infos), node.log
+        for step_s in (1, 1, -5):
+            client.now_ns += step_s * 10**9
+            if step_s < 0:      # as a bag that loops
+                client.send_pixels(ros.BLANK, infos=infos)
+            stamps = [client.now_ns + ros.STEP_NS, client.now_ns + ros.STEP_NS + 5_000_000]
+            poses = [np.c_[ros.pose_at(plane, stamp)] for plane, stamp in zip('ab', stamps)]
+            path, _ = client.answer(client.send_pixels([ros.draw(ros.intrinsics() @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))
+            assert path.header.frame_id == 'cell'
+            assert np.linalg.norm(ros.points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < 0.0025
+
+
+def test_parameter_files_that_are_installed(tmp_path):
+    """Each in a node of its own, in a namespace of its own."""
+    yaml = pytest.importorskip('yaml')
+    with contextlib.ExitStack() as stack:
+        nodes, given = {}, {}
+        for name in ('defaults', 'preset_needle', 'preset_catheter', 'preset_concentric_tube'):
+            file = resource_path(f'{name}.yaml')
+            given[name] = yaml.safe_load(file.read_text())['/**']['ros__parameters']
+            arguments = ['--params-file', str(file), '-r', f'__ns:=/{name}']
+            nodes[name] = stack.enter_context(NodeProcess(tmp_path / f'{name}.txt', arguments=arguments, domain=ros.OTHER))
+        client = stack.enter_context(Client(domain=ros.OTHER))
+        for name, values in given.items():
+            taken = client.get(*values, node=f'/{name}/fluoro_shape')
+            assert [list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)] == list(values.values()), name
+        assert client.hears('no image yet: nobody publishes /defaults/plane_a/image_raw and /defaults/plane_a/camera_info')
 
 
 def run(*arguments, code=None):

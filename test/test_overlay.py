@@ -46,9 +46,15 @@ def near(pixels, colour):
 def test_the_backbone_is_drawn_where_the_image_as_received_shows_it(views):
     picture = o.overlay(GREY, 0, found(), views)
     assert picture.shape == (SIZE, SIZE, 3) and picture.dtype == np.uint8
-    track = distort(views[0], project(views[0].P, straight().points[5:-5]))
+    track = distort(views[0], project(views[0].P, straight().points[5:-10]))      # up to the ring around the tip
     assert near(colour_at(picture, track), o.FOUND) == 1
     assert np.allclose(track[0], project(VIEWS[0].P, straight().points[5]), atol=0.1) == (views is VIEWS)
+
+
+def test_a_ring_shows_where_the_tip_is():
+    ring = np.hypot(*(np.mgrid[:SIZE, :SIZE] - 405.5 + np.array([0, 50])[:, None, None])).round() == o.RING     # rows, columns
+    red = [o.overlay(GREY, 0, result, VIEWS)[ring].astype(int) @ (-1, -1, 2) for result in (found(straight(sigma=1e-5)), rejected())]
+    assert np.median(red[0]) > 60 and red[1].max() == 0
 
 
 def test_what_was_seen_is_drawn_for_a_rejected_pair_too():

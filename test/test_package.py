@@ -1,6 +1,7 @@
 """What must agree across files, what must work without ROS, and what every executable does with --help and nonsense."""
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -11,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from fluoro_shape_ros import resources
-from fluoro_shape_ros.config import fields
+from fluoro_shape_ros.config import constraint, fields
+from fluoro_shape_ros.data import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
 PROFILE = 'fastdds_large_images.xml'
@@ -69,7 +71,22 @@ def test_data_files_exist_and_ros2_run_finds_every_executable():
 def test_readme_lists_every_parameter_as_it_is():
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
     shown = text.split('<!-- parameters -->\n')[1].split('<!-- /parameters -->')[0]
-    assert shown.strip() == parameter_table(), 'python test/test_package.py prints the table'
+    assert shown.strip() == parameter_table(), 'python test/test_package.py writes the table'
+
+
+def test_the_file_of_defaults_is_true():
+    assert resources.resource_path('defaults.yaml').read_text() == defaults_file(), 'python test/test_package.py writes it'
+
+
+def test_troubleshooting_names_every_rejection():
+    text = (ROOT / 'README.md').read_text(encoding='utf-8').split('## Troubleshooting\n')[1].split('\n## ')[0]
+    assert [o.value for o in Outcome if o is not Outcome.OK and f'`{o.value}' not in text] == []
+
+
+def test_what_readme_and_docs_link_to_exists():
+    for page in (ROOT / 'README.md', ROOT / 'docs' / 'connect.md'):
+        targets = re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', page.read_text(encoding='utf-8'))
+        assert targets and [t for t in targets if not (page.parent / t).exists()] == [], page
 
 
 def parameter_table() -> str:
@@ -77,10 +94,27 @@ def parameter_table() -> str:
     rows = ['| parameter | default | unit | range | what it is |', '|---|---|---|---|---|']
     for f in fields():
         m = f.metadata
-        default = list(f.default) if m['element'] else f.default
-        span = ', '.join(m['choices']) or ('' if m['low'] is None else f'{m["low"]:g} to {m["high"]:g}')
-        rows.append(f'| `{f.name}` | `{json.dumps(default)}` | {m["unit"]} | {span} | {m["description"]} |')
+        rows.append(f'| `{f.name}` | `{_default(f)}` | {m["unit"]} | {_range(f).removeprefix("one of: ")} | {m["description"]} |')
     return '\n'.join(rows)
+
+
+def defaults_file() -> str:
+    """resource/defaults.yaml."""
+    lines = ['# Every parameter of fluoro_shape_node with its default: copy, change, and give it with `--ros-args --params-file`.',
+             '# Made from config.py. `/**` means: whatever the namespace of the node is.', '/**:', '  ros__parameters:']
+    for f in fields():
+        notes = ', '.join(filter(None, (f.metadata['unit'], _range(f))))
+        lines += [f'    # {f.metadata["description"]}' + (f' ({notes})' if notes else ''), f'    {f.name}: {_default(f)}']
+    return '\n'.join(lines) + '\n'
+
+
+def _default(f) -> str:
+    return json.dumps(list(f.default) if f.metadata['element'] else f.default)
+
+
+def _range(f) -> str:
+    m = f.metadata
+    return constraint(f) or ('' if m['low'] is None else f'{m["low"]:g} to {m["high"]:g}')
 
 
 # ---- resources
@@ -148,4 +182,8 @@ def test_help_and_nonsense(name):
 
 
 if __name__ == '__main__':
-    print(parameter_table())
+    readme = ROOT / 'README.md'
+    before, rest = readme.read_text(encoding='utf-8').split('<!-- parameters -->\n')
+    after = rest.split('<!-- /parameters -->')[1]
+    readme.write_text(f'{before}<!-- parameters -->\n{parameter_table()}\n<!-- /parameters -->{after}', encoding='utf-8')
+    (ROOT / 'resource' / 'defaults.yaml').write_text(defaults_file())

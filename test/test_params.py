@@ -92,6 +92,8 @@ def test_descriptors_say_what_the_config_knows(make):
         ranges = [*d.floating_point_range, *d.integer_range]
         assert [(r.from_value, r.to_value) for r in ranges] == ([] if f.metadata['low'] is None else [(f.metadata['low'], f.metadata['high'])])
     assert node.describe_parameter('base_position').type == ParameterType.PARAMETER_DOUBLE_ARRAY
+    assert node.describe_parameter('base_position').additional_constraints == 'none or 3 numbers'
+    assert node.describe_parameter('expected_length').additional_constraints == 'none or 2 numbers, 0 <= min < max'
     assert node.describe_parameter('robot_radius').type == ParameterType.PARAMETER_DOUBLE
     assert node.describe_parameter('threads').type == ParameterType.PARAMETER_INTEGER
 

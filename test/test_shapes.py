@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_shape_ros.data import Shape
 from msg_adapters.messages import stamp_ns
 from msg_adapters.shapes import (ANY_ANGLE_VARIANCE, MAX_POSES, UNKNOWN_VARIANCE, BadPath, orientations, path_to_points, shape_to_cloud, shape_to_path,
-                                 shape_to_tip, shape_to_tip_pose, tangents, tip_covariance)
+                                 shape_to_path_cdr, shape_to_tip, shape_to_tip_pose, tangents, tip_covariance)
 
 STAMP, FRAME = 7_000_000_123, 'cell'
 
@@ -180,3 +180,15 @@ def test_an_endless_path_is_refused(new):
     msg.poses = list(msg.poses) * (MAX_POSES + 1)
     with pytest.raises(BadPath, match=f'{MAX_POSES + 1} poses'):
         path_to_points(msg)
+
+
+@pytest.mark.parametrize('frame_id', ['', 'cell', 'plane_a', 'isocenter', 'plane_a_optical', 'r\u00f6ntgen'])      # all alignments
+@pytest.mark.parametrize('n', [1, 2, 30])
+def test_a_path_is_serialised_as_ros_does_it(frame_id, n):
+    serialization = pytest.importorskip('rclpy.serialization')
+    from msg_adapters.messages import ros_message
+    case = straight([1, -2, 3], n)
+    expected = shape_to_path(case, STAMP, frame_id, ros_message)
+    got = shape_to_path_cdr(case, STAMP, frame_id)
+    assert serialization.deserialize_message(got, type(expected)) == expected
+    assert len(got) == len(serialization.serialize_message(expected))       # padding may hold anything

@@ -1,6 +1,7 @@
 """Strips across a drawn line of known place: offset, presence, width, speed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.special import ndtr
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
-from fluoro_shape_ros.strips import cut, cut_along, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
+from fluoro_shape_ros.strips import WIDTHS, Measurement, Strips, cut, cut_along, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -39,19 +40,32 @@ def draw(direction, offset_px=0.0, *, depth=30.0, half_width=HALF_WIDTH, noise=0
     return (200 + 0.1 * at[0] - dark + np.random.default_rng(seed).normal(0, noise, U.shape)).astype(np.float32)
 
 
+def only(planes):
+    """The arrays of the one plane looked at."""
+    return SimpleNamespace(**{k: v[0] if k != 'offsets_px' or isinstance(planes, Measurement) else v for k, v in vars(planes).items()})
+
+
 def strips_of(direction, image=None, field=FIELD, view=VIEW, reach=REACH, **drawing):
-    return cut(draw(direction, **drawing) if image is None else image, field, view, *line(direction), reach)
+    return cut([draw(direction, **drawing) if image is None else image], [field], [view], *line(direction), reach)
 
 
-def profile(strips):
-    return shadow(HALF_WIDTH, strips.offsets_px)
+def measured(strips, on=None):
+    return only(measure(strips, shadow(HALF_WIDTH, strips.offsets_px)[None], on))
+
+
+def searched(strips):
+    return only(search(strips, shadow(HALF_WIDTH, np.arange(-REACH, REACH + 1))[None]))
+
+
+def alike(strips):
+    return likeness(mean_profile(strips.profiles[0], ALL), HALF_WIDTH)[np.abs(WIDTHS - 1).argmin()]
 
 
 @pytest.mark.parametrize('direction', [(1, 0, 0), (0, 0, 1), (-1, 0, 0.4), (1, 0.3, 1)])
 @pytest.mark.parametrize('offset', [0.0, 0.07, -0.15])
 def test_a_known_offset_is_measured(direction, offset):
     strips = strips_of(direction, offset_px=offset)
-    m = measure(strips, profile(strips))
+    m = measured(strips)
     assert abs(np.median(m.offset_px) - offset) < 0.02
     assert np.abs(m.offset_px - offset).max() < 0.07        # interpolation between pixels
     assert_allclose(m.presence, 1, atol=0.03)
@@ -60,7 +74,7 @@ def test_a_known_offset_is_measured(direction, offset):
 def test_a_background_that_curves_changes_nothing():
     image = draw((1, 0, 0), 0.1, noise=0.5)
     bowl = (0.2 * (V - 120) ** 2).astype(np.float32)
-    flat, curved = (measure(strips, profile(strips)) for strips in (strips_of((1, 0, 0), i) for i in (image, image + bowl)))
+    flat, curved = (measured(strips) for strips in (strips_of((1, 0, 0), i) for i in (image, image + bowl)))
     assert_allclose(curved.offset_px, flat.offset_px, atol=1e-3)
     assert_allclose(curved.variance, flat.variance, rtol=1e-2)
 
@@ -70,14 +84,14 @@ def test_offsets_settle_where_strips_follow_them():
     at = 0.0
     for _ in range(4):
         strips = strips_of((1, 0, 0), offset_px=1.5 - at)
-        at += np.median(measure(strips, profile(strips)).offset_px)
+        at += np.median(measured(strips).offset_px)
     assert abs(at - 1.5) < 0.02
 
 
 @pytest.mark.parametrize('noise', [1.0, 4.0])
 def test_the_variance_is_that_of_the_scatter(noise):
     strips = strips_of((1, 0, 0.4), offset_px=0.2, noise=noise)
-    m = measure(strips, profile(strips))
+    m = measured(strips)
     z = (m.offset_px - 0.2) / np.sqrt(m.variance)
     assert 0.8 < z.std() < 1.3                              # interpolated noise is correlated
     assert 0.75 < (m.presence - 1).std() / m.presence_sigma < 1.3
@@ -86,7 +100,7 @@ def test_the_variance_is_that_of_the_scatter(noise):
 def test_presence_is_1_on_the_device_and_0_beyond_it():
     strips = strips_of((1, 0, 0), upto_px=120.0, noise=0.5)
     on = np.arange(len(S)) < 120
-    m = measure(strips, profile(strips), on)
+    m = measured(strips, on)
     assert_allclose(m.presence[:115], 1, atol=0.1)
     assert_allclose(m.presence[126:], 0, atol=0.1)
     assert 0.3 < m.presence[120] < 0.7
@@ -96,17 +110,18 @@ def test_outside_the_field_nothing_is_measured():
     field = FIELD.copy()
     field[:, 150:] = 0
     strips = strips_of((-1, 0, 0), field=field, noise=0.5)        # u grows along it: the image shows the patient's right to the left
-    u = strips.centers_px[:, 0]
+    u = strips.centers_px[0, :, 0]
     assert (np.diff(u) > 0).all()
-    assert (strips.inside == (u < 149.5)).all()
-    m = measure(strips, profile(strips))
-    assert np.isinf(m.variance[~strips.inside]).all() and np.isfinite(m.variance[strips.inside]).all()
-    assert np.isnan(m.presence[~strips.inside]).all() and np.isfinite(m.presence[strips.inside]).all()
+    inside = strips.inside[0]
+    assert (inside == (u < 149.5)).all()
+    m = measured(strips)
+    assert np.isinf(m.variance[~inside]).all() and np.isfinite(m.variance[inside]).all()
+    assert np.isnan(m.presence[~inside]).all() and np.isfinite(m.presence[inside]).all()
 
 
 def test_speed_is_the_magnification_times_the_sine_of_the_ray():
     for direction, sine in (((1, 0, 0), 1.0), ((1, 1, 0), np.sqrt(0.5)), ((0, 1, 2), 2 / np.sqrt(5))):    # the beam runs along y
-        strips = strips_of(direction)
+        strips = only(strips_of(direction))
         middle = slice(95, 105)
         assert_allclose(strips.speed[middle], sine / PX, rtol=3e-3)
         assert_allclose(np.einsum('ni,ni->n', strips.normals[middle], np.gradient(strips.centers_px, axis=0)[middle]), 0, atol=1e-3)
@@ -121,16 +136,16 @@ def test_strips_follow_a_distorted_image():
     assert np.abs(ideal - pixels).max() > 1
     image = draw((1, 0, 0.6), 0.1, at=ideal.T.reshape(2, 256, 256))
     known = strips_of((1, 0, 0.6), image, view=bent)
-    assert np.abs(measure(known, profile(known)).offset_px - 0.1).max() < 0.05
+    assert np.abs(measured(known).offset_px - 0.1).max() < 0.05
     ignored = strips_of((1, 0, 0.6), image)
-    found = measure(ignored, profile(ignored))
+    found = measured(ignored)
     assert not (np.isfinite(found.variance) & (np.abs(found.offset_px - 0.1) < 0.3)).all()
 
 
 @pytest.mark.parametrize('offset', [-7, 0, 6])
 def test_search_finds_a_line_far_off(offset):
     strips = strips_of((0, 0, 1), reach=REACH + 8, offset_px=offset, noise=2.0)
-    found = search(strips, shadow(HALF_WIDTH, np.arange(-REACH, REACH + 1)))
+    found = searched(strips)
     assert np.median(found.offset_px) == offset and np.mean(np.abs(found.offset_px - offset) <= 1) > 0.95
     assert np.isfinite(found.variance).mean() > 0.95
 
@@ -139,8 +154,8 @@ def test_search_does_not_believe_what_hides_the_device():
     image = draw((-1, 0, 0), noise=2.0)
     image[100:160, 80:120] = 20
     strips = strips_of((-1, 0, 0), image, reach=REACH + 8)
-    u = strips.centers_px[:, 0]
-    believed = np.isfinite(search(strips, shadow(HALF_WIDTH, np.arange(-REACH, REACH + 1))).variance)
+    u = strips.centers_px[0, :, 0]
+    believed = np.isfinite(searched(strips).variance)
     assert not believed[(u > 85) & (u < 115)].any() and believed[(u < 70) | (u > 130)].mean() > 0.95
 
 
@@ -158,32 +173,33 @@ def test_a_shadow_by_hand():
 @pytest.mark.parametrize('half_width, low, high', [(2.0, 0.995, 1.0), (1.5, 0.97, 1.0), (2.5, 0.97, 1.0), (5.0, 0.3, 0.86)])
 def test_likeness_knows_the_devices_width(half_width, low, high):
     strips = strips_of((1, 0, 0), half_width=half_width, noise=1.0)
-    assert low < likeness(mean_profile(strips, ALL), HALF_WIDTH) <= high
+    assert low < alike(strips) <= high
 
 
 def test_a_bright_line_is_the_opposite_and_an_edge_is_unlike():
     bright = strips_of((1, 0, 0), depth=-30.0)
-    assert likeness(mean_profile(bright, ALL), HALF_WIDTH) < -0.95
+    assert alike(bright) < -0.95
     edge = strips_of((1, 0, 0), np.where(V > 127.5, 200, 100).astype(np.float32))
-    assert abs(likeness(mean_profile(edge, ALL), HALF_WIDTH)) < 0.2
+    assert abs(alike(edge)) < 0.2
 
 
 def test_the_devices_own_shadow_replaces_the_expected_one_where_there_is_enough_of_it():
     strips = strips_of((1, 0, 0), half_width=2.5, noise=0.5)
-    expected = profile(strips)
-    own = own_shadow(strips, ALL, expected)
+    expected = shadow(HALF_WIDTH, strips.offsets_px)
+    own = own_shadow(strips.profiles[0], strips.offsets_px, ALL, expected)
     assert_allclose(own, shadow(2.5, strips.offsets_px), atol=0.06)
     assert np.abs(own - expected).max() > 0.1
     assert_allclose(own, own[::-1], atol=1e-6)
-    assert_allclose(own_shadow(strips, np.arange(len(S)) < 10, expected), expected)
+    assert_allclose(own_shadow(strips.profiles[0], strips.offsets_px, np.arange(len(S)) < 10, expected), expected)
     nothing = strips_of((1, 0, 0), depth=0.0, noise=0.5)
-    assert_allclose(own_shadow(nothing, ALL, expected), expected)
+    assert_allclose(own_shadow(nothing.profiles[0], nothing.offsets_px, ALL, expected), expected)
 
 
-def test_strips_along_a_line_of_pixels():
+def test_strips_along_lines_of_pixels():
     points = np.c_[np.arange(30, 200.0), np.full(170, 127.5)]
-    strips = cut_along(draw((1, 0, 0), offset_px=0.0), FIELD, points + [0, 0.15], REACH)
+    strips, of = cut_along(draw((1, 0, 0), offset_px=0.0), FIELD, [points[:30], points + [0, 0.15]], REACH)
+    assert of.tolist() == [0] * 10 + [1] * 57
     assert_allclose(np.abs(strips.normals), np.tile([0, 1], (len(strips.normals), 1)), atol=1e-9)
-    assert 40 < len(strips.centers_px) <= 170 and np.ptp(strips.centers_px[:, 0]) > 160
-    m = measure(strips, profile(strips))
-    assert_allclose(m.offset_px * strips.normals[:, 1], -0.15, atol=0.02)
+    assert np.ptp(strips.centers_px[of == 1, 0]) > 160
+    planes = Strips(*(a if k == 'offsets_px' else a[None, of == 1] for k, a in vars(strips).items()))
+    assert_allclose(measured(planes).offset_px * strips.normals[of == 1, 1], -0.15, atol=0.02)

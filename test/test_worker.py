@@ -24,8 +24,9 @@ def info(P=P_A, frame_id='plane_a_optical', **fields):
     return SimpleNamespace(**{**values, **fields})
 
 
-def image(value=7, size=40, encoding='mono8'):
-    return SimpleNamespace(encoding=encoding, height=size, width=size, step=size, is_bigendian=0, data=bytes([value]) * size * size)
+def image(value=7, size=40, encoding='mono8', stamp=5):
+    head = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=stamp))
+    return SimpleNamespace(header=head, encoding=encoding, height=size, width=size, step=size, is_bigendian=0, data=bytes([value]) * size * size)
 
 
 def job(images=None, infos=None, generation=0, prediction=None, **values):
@@ -72,8 +73,9 @@ def test_poses_come_from_tf_when_they_should():
     def lookup(reference, camera_frame, stamp_ns):
         asked.append((reference, camera_frame, stamp_ns))
         return ((1.0, 0, 0), (0, 0, -1.0), (0, 1.0, 0)), (0.0, 0.0, 0.8)
-    frame = adapt(job(geometry='tf', reference_frame='cell'), view_of, lookup, Tally())
-    assert asked == [('cell', 'plane_a_optical', 5), ('cell', 'plane_b_optical', 5)]
+    infos = info(), info(frame_id='plane_b_optical')
+    frame = adapt(job((image(), image(stamp=8)), infos, geometry='tf', reference_frame='cell'), view_of, lookup, Tally())
+    assert asked == [('cell', 'plane_a_optical', 5), ('cell', 'plane_b_optical', 8)]
     assert np.allclose(frame.views[0].P, [[500, 20, 0, 16], [0, 20, -500, 16], [0, 1, 0, 0.8]])
 
 

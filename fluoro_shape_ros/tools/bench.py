@@ -6,18 +6,21 @@ import argparse
 import dataclasses
 import json
 import math
+import os
 from pathlib import Path
 
 from tqdm import tqdm
 
 from ..config import fields
+from . import latency, memory, speed
 from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, on_real
-from .speed import report
+from .latency import moving_scenes
 from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
+DEVICE = 9              # default seed of what moves in front of the node
 METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
 
 
@@ -29,19 +32,100 @@ def main(argv=None) -> int:
     robustness = _add_tables(commands, 'robustness', 'one difficulty at a time, and scenes where nothing may be published', ROBUSTNESS)
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
-    timing = commands.add_parser('speed', help='how long a pair takes, checked against truth, beside a yardstick timed in the same run')
-    timing.add_argument('--sizes', type=_count, nargs='+', default=[512, 1024, 2048], metavar='PX', help='image sizes (default: 512 1024 2048)')
-    timing.add_argument('--scenes', type=_count, default=5, metavar='N', help='anatomy scenes of each size (default: 5)')
-    timing.add_argument('--rounds', type=_count, default=10, metavar='N', help='how often each is timed (default: 10)')
-    timing.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
-    timing.set_defaults(body=_speed)
+    _add_speed(commands)
+    _add_latency(commands)
+    _add_memory(commands)
     return run(lambda args: args.body(args, parser), parser, argv)
+
+
+def _add_speed(commands) -> None:
+    text = 'how long a pair takes, checked against truth, in ms and in multiples of a yardstick that is timed in between'
+    command = commands.add_parser('speed', help=text, description=f'{text[0].upper()}{text[1:]}.')
+    command.add_argument('--sizes', type=_count, nargs='+', default=[512, 768, 1024, 1536, 2048], metavar='PX',
+                         help='image sizes; all show the same field at the same dose (default: 512 768 1024 1536 2048)')
+    command.add_argument('--scenes', type=_count, default=20, metavar='N', help='anatomy scenes of each size (default: 20)')
+    command.add_argument('--rounds', type=_count, default=5, metavar='N', help='how often each is timed, all others in between (default: 5)')
+    command.add_argument('--first-seed', type=_seed, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    command.add_argument('--alone', action='store_true', help='without method paper and skimage\'s frangi, which take seconds a pair')
+    command.add_argument('--json', type=Path, metavar='FILE', help='write every time there, in s')
+    command.set_defaults(body=_speed)
 
 
 def _speed(args, parser: argparse.ArgumentParser) -> int:
     """Print the table of times."""
-    print(report(args.sizes, args.scenes, args.rounds, args.first_seed))
+    _check_files(args.json)
+    beside = 1024 if 1024 in args.sizes else args.sizes[0]
+    found = [laps for size in sorted(set(args.sizes))
+             for laps in speed.measure(size, args.scenes, args.rounds, args.first_seed, speed.COMPARED if size == beside and not args.alone else 0)]
+    if not any(laps.right for laps in found):
+        raise ToolError(f'none of {args.scenes} scenes a size was answered rightly, so no time means anything')
+    print(speed.table(found))
+    if args.json:
+        args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'laps': speed.plain(found)}, indent=1) + '\n')
     return 0
+
+
+def _add_latency(commands) -> None:
+    text = 'how late an answer is on real topics, beside CPU, memory, start-up and what is lost, at several rates'
+    command = commands.add_parser('latency', help=text, description=f'{text[0].upper()}{text[1:]}: the node runs as a process of its own.')
+    command.add_argument('--rates', type=_positive, nargs='+', default=[7.5, 15, 30, 60, 200], metavar='HZ', help='pairs a second (default: 7.5 15 30 60 200)')
+    command.add_argument('--seconds', type=_positive, default=60.0, metavar='S', help='at each rate (default: 60)')
+    command.add_argument('--as-shipped', action='store_true', help='Fast DDS as it comes, without this package\'s profile for megapixel images')
+    command.add_argument('--full', action='store_true', help='parameter tracking off: every pair is searched from scratch')
+    _add_node_options(command)
+    command.set_defaults(body=_latency)
+
+
+def _add_memory(commands) -> None:
+    text = 'whether the node\'s memory grows'
+    command = commands.add_parser('memory', help=text, description=f'{text[0].upper()}{text[1:]}: it runs as a process of its own, on real topics.')
+    command.add_argument('--pairs', type=_count, default=10_000, metavar='N', help='(default: 10000)')
+    command.add_argument('--everything', action='store_true', help='subscribe to overlays, markers and points too')
+    _add_node_options(command)
+    command.set_defaults(body=_memory)
+
+
+def _add_node_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument('--size', type=_count, default=1024, metavar='PX', help='of the images (default: 1024)')
+    command.add_argument('--rendered', type=_count, default=32, metavar='N', help='pairs that are rendered beforehand and played forth and back (default: 32)')
+    command.add_argument('--seed', type=_seed, default=DEVICE, help='another seed is another device and anatomy')
+    command.add_argument('--domain', type=int, choices=range(233), default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
+    command.add_argument('--json', type=Path, metavar='FILE', help='write what was measured there, in s and bytes')
+
+
+def _ready_for_ros(args) -> None:
+    """Raises ToolError without ROS; after this it may be used."""
+    _check_files(args.json)
+    need('rclpy', 'ros')
+    os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
+    latency.choose_profile(getattr(args, 'as_shipped', False))
+
+
+def _latency(args, parser: argparse.ArgumentParser) -> int:
+    """Print a line a rate."""
+    _ready_for_ros(args)
+    rows = [latency.measure(rate, args.seconds, moving_scenes(args.size, rate, args.seed, args.rendered), not args.full) for rate in args.rates]
+    print(latency.table(rows, args.as_shipped))
+    if args.json:
+        args.json.write_text(json.dumps({'command': args.command, 'as_shipped': args.as_shipped, 'rows': [latency.plain(r) for r in rows]}, indent=1) + '\n')
+    return 0
+
+
+def _memory(args, parser: argparse.ArgumentParser) -> int:
+    """Print how much it was and how it grew."""
+    _ready_for_ros(args)
+    measured = memory.measure(args.pairs, moving_scenes(args.size, memory.RATE, args.seed, args.rendered), args.everything)
+    print(memory.report(measured, args.size))
+    if args.json:
+        args.json.write_text(json.dumps({'command': args.command, **dataclasses.asdict(measured), 'growth': measured.growth}, indent=1) + '\n')
+    return 0
+
+
+def _check_files(*files: Path | None) -> None:
+    """Raises ToolError for one that could not be written when the work is done."""
+    for file in filter(None, files):
+        if not file.absolute().parent.is_dir():
+            raise ToolError(f'{file}: there is no such folder')
 
 
 def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
@@ -73,9 +157,7 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
         parser.error(f'no such family: {", ".join(unknown)}; there are {", ".join(known)}{hint}')
     if args.plot and args.plot.suffix.lower() != '.png':
         parser.error(f'--plot {args.plot}: only .png can be drawn')
-    for file in filter(None, (args.json, args.plot)):
-        if not file.absolute().parent.is_dir():
-            raise ToolError(f'{file}: there is no such folder')
+    _check_files(args.json, args.plot)
     if args.first_seed < 0:
         parser.error(f'--first-seed {args.first_seed}: seeds count from 0')
     if 'p' in names:
@@ -109,6 +191,18 @@ def _plain(trial: Trial) -> dict:
 def _plain_answer(a: Answer) -> dict:
     return {'outcome': a.outcome.value, 'detail': a.detail, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None,
             'surprise': None if math.isnan(a.surprise) else min(a.surprise, 1e12), 'within': a.within, 'silent_failure': a.silent_failure}
+
+
+def _positive(text: str) -> float:
+    if not 0 < (number := float(text)) < 1e6:
+        raise argparse.ArgumentTypeError(f'{text} is not above zero')
+    return number
+
+
+def _seed(text: str) -> int:
+    if (number := int(text)) < 0:
+        raise argparse.ArgumentTypeError(f'{text}: seeds count from 0')
+    return number
 
 
 def _count(text: str) -> int:

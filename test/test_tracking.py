@@ -1,0 +1,109 @@
+"""Starting from the pair before: the same answers as a search of the whole images, also where the device moves fast, jumps or is gone for a while."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from fluoro_shape_ros.config import Config
+from fluoro_shape_ros.data import Prior
+from fluoro_shape_ros.pipeline import reconstruct
+from fluoro_shape_ros.sim.carm import CArm, biplane
+from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.sim.shapes import posed
+
+VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
+STEP = 0.030 / 15       # m from pair to pair at 30 mm/s and 15 pairs/s
+SAME, SAME_TIP = 0.02e-3, 0.1e-3    # m
+RIGHT = 0.3e-3          # m, of the truth
+
+
+@cache
+def run(seed=5):
+    return xray_run(seed, views=VIEWS, lengths=(0.06, 0.07))
+
+
+CONFIG = Config.from_values(base_position=run().backbone()[0].tolist())
+
+
+def pictures(shapes):
+    """Scenes of the run's device in these shapes, each with noise of its own."""
+    return [replace(run(), shape=shape).scene(index=k) for k, shape in enumerate(shapes)]
+
+
+def moved(x, y=0.0, z=0.0):
+    """The device as a whole elsewhere, m."""
+    shape = run().shape
+    return replace(shape, pose=replace(shape.pose, base=shape.pose.base + [x, y, z]))
+
+
+def search(scene):
+    return reconstruct(scene.frame, CONFIG)
+
+
+def follow(scenes, previous=None):
+    """The answers, each beginning from the last shape."""
+    answers = []
+    for scene in scenes:
+        answers.append(reconstruct(scene.frame, CONFIG, Prior(previous=previous)))
+        previous = answers[-1].shape or previous
+    return answers
+
+
+def same(a, b):
+    """Whether two shapes are within SAME of each other, taken over their lengths, and their tips within what noise does to a tip."""
+    fine = [np.array([np.interp(np.linspace(0, x.length, 4000), x.s, c) for c in x.points.T]).T for x in (a, b)]
+    between = max(cKDTree(one).query(other)[0].mean() for one, other in (fine, fine[::-1]))
+    return between < SAME and np.linalg.norm(a.tip - b.tip) < SAME_TIP
+
+
+def is_right(answer, scene):
+    return answer.shape is not None and cKDTree(scene.truth).query(answer.shape.points)[0].mean() < RIGHT \
+        and np.linalg.norm(answer.shape.tip - scene.truth[-1]) < 2 * RIGHT
+
+
+MOTIONS = {
+    'sliding in': [posed(run().shape, 1 - k / 5, 0.0) for k in range(5)],       # by 2.4 to 2.8 mm a pair
+    'bending': [posed(run().shape, 0.0, k / 5) for k in range(5)],
+    'fast across': [moved(k * STEP * 0.6, -k * STEP * 0.6, k * STEP * 0.53) for k in range(5)],
+    'back and forth': [moved(STEP * (k % 2)) for k in range(5)],                # whatever was expected from the pairs before is wrong
+}
+
+
+@pytest.mark.parametrize('motion', MOTIONS)
+def test_tracking_answers_as_a_search_does_and_needs_none(motion):
+    scenes = pictures(MOTIONS[motion])
+    for scene, answer in zip(scenes[1:], follow(scenes)[1:]):
+        searched = search(scene)
+        assert is_right(answer, scene) and is_right(searched, scene), (answer.detail, searched.detail)
+        assert same(answer.shape, searched.shape)
+        assert 'track' in answer.stage_seconds and 'detect' not in answer.stage_seconds
+
+
+@pytest.mark.parametrize('there', [moved(0.02, 0.0, -0.02), posed(run().shape, 1.0, 1.0)], ids=['elsewhere', 'another shape'])
+def test_a_device_that_jumps_is_found_in_the_same_pair(there):
+    before, after = pictures([run().shape, there])
+    answer = follow([before, after])[1]
+    assert is_right(answer, after) and same(answer.shape, search(after).shape)
+
+
+@pytest.mark.parametrize('missed', [1, 3, 10])
+def test_missed_pairs_do_no_harm(missed):
+    before, after = pictures([run().shape, moved((missed + 1) * STEP)])
+    answer = follow([before, after])[1]
+    assert is_right(answer, after) and same(answer.shape, search(after).shape)
+
+
+def test_nothing_is_found_where_the_device_was_and_is_no_more():
+    before, after = pictures([run().shape, moved(STEP)])
+    gone, back = reconstruct(run().without_device(), CONFIG, Prior(previous=search(before).shape)), follow([before, after])[1]
+    assert gone.shape is None and is_right(back, after)
+
+
+def test_without_tracking_the_previous_shape_changes_nothing():
+    scene, = pictures([run().shape])
+    config = CONFIG.replace(tracking=False)
+    plain, given = reconstruct(scene.frame, config), reconstruct(scene.frame, config, Prior(previous=search(scene).shape))
+    assert 'track' not in given.stage_seconds and np.array_equal(plain.shape.points, given.shape.points)
