@@ -3,11 +3,14 @@
 import cv2
 import numpy as np
 
+from fluoro_shape_ros.geometry import make_view
+from fluoro_shape_ros.sim import xray
 from msg_adapters.calibration import Calibration
 
 SIZE = 320                          # px, both ways
 K = np.array([[800.0, 0, (SIZE - 1) / 2], [0, 800.0, (SIZE - 1) / 2], [0, 0, 1]])
-TOLERANCE = 0.0025                  # m: a pixel is 1 mm, the line is drawn on whole pixels
+RADIUS = 1e-3                       # m, of the wire
+TOLERANCE = 0.0025                  # m: a pixel is 1 mm
 
 
 def curve():
@@ -24,12 +27,9 @@ def projection(angle):
 
 
 def draw(P, device=True):
-    """(SIZE, SIZE) uint8: a dark blurred line on a bright, even background."""
-    image = np.full((SIZE, SIZE), 180, np.uint8)
-    if device:
-        x = np.c_[curve(), np.ones(600)] @ P.T
-        cv2.polylines(image, [np.round(x[:, :2] / x[:, 2:] * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
-    return cv2.GaussianBlur(image, (5, 5), 0)
+    """(SIZE, SIZE) uint8: the shadow of a round wire, blurred, on a bright, even background."""
+    wire = xray.transmission(curve(), RADIUS, make_view('a', P, SIZE, SIZE), xray.Exposure(contrast=0.7)) if device else np.ones((SIZE, SIZE), np.float32)
+    return np.rint(cv2.GaussianBlur(180 * wire, (5, 5), 0)).astype(np.uint8)
 
 
 VIEWS = [projection(0), projection(np.pi / 2)]
