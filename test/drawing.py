@@ -26,13 +26,13 @@ def projection(angle):
     return K @ np.c_[np.stack([right, np.cross(forward, right), forward]), [0, 0, 0.8]]
 
 
-def draw(P, device=True):
-    """(SIZE, SIZE) uint8: the shadow of a round wire, blurred, on a bright, even background."""
-    wire = xray.transmission(curve(), RADIUS, make_view('a', P, SIZE, SIZE), xray.Exposure(contrast=0.7)) if device else np.ones((SIZE, SIZE), np.float32)
+def draw(P, size=SIZE, device=True, points=curve()):    # noqa: B008 (never changed)
+    """(size, size) uint8: the shadow of a round wire along (N, 3) points, blurred, on a bright, even background."""
+    wire = xray.transmission(points, RADIUS, make_view('a', P, size, size), xray.Exposure(contrast=0.7)) if device else np.ones((size, size), np.float32)
     return np.rint(cv2.GaussianBlur(180 * wire, (5, 5), 0)).astype(np.uint8)
 
 
 VIEWS = [projection(0), projection(np.pi / 2)]
-GOOD, BLANK = ([draw(P, device) for P in VIEWS] for device in (True, False))
+GOOD, BLANK = ([draw(P, device=device) for P in VIEWS] for device in (True, False))
 CALIBRATIONS = [Calibration(f'plane_{p}', SIZE, SIZE, K, P, 'plumb_bob', np.zeros(5)) for p, P in zip('ab', VIEWS)]
 BASE = 'base_position=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])      # so that the tip is no guess

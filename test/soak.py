@@ -33,14 +33,8 @@ def projection(angle_deg):
 
 def picture(P, device=True):
     """(SIZE, SIZE) uint8 of the device, 3 px wide, on an even background with noise."""
-    image = ros.cv2.resize(ros.draw(projection_of(P), 2 * ros.SIZE, device), (SIZE, SIZE), interpolation=ros.cv2.INTER_AREA)
+    image = ros.draw(P, SIZE, device)
     return np.clip(image + np.random.default_rng(3).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
-
-
-def projection_of(P):
-    """The P of twice ros_client's size that shows what `P` shows in SIZE."""
-    scale = 2 * ros.SIZE / SIZE
-    return np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]]) @ P
 
 
 class Soak:
