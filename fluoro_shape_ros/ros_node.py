@@ -125,7 +125,7 @@ class FluoroShapeNode(Node):
     def _on_camera_info(self, plane: str, msg) -> None:
         book = self._books[plane]
         try:
-            known = camera(msg)
+            known = camera(msg, plane)
             if known != book.newest:
                 known = checked_camera(msg, self._config, plane)
         except BadCameraInfo as error:

@@ -38,9 +38,9 @@ class Camera:
         return roi.x_offset, roi.y_offset, roi.width, roi.height, self.msg.binning_x, self.msg.binning_y
 
 
-def camera(msg) -> Camera:
-    """The camera of a sensor_msgs/CameraInfo, unchecked but for its lengths. Raises BadCameraInfo where these are absurd."""
-    check_lengths(msg)
+def camera(msg, plane: str = '') -> Camera:
+    """The camera of a plane's sensor_msgs/CameraInfo, unchecked but for its lengths. Raises BadCameraInfo where these are absurd."""
+    check_lengths(msg, plane)
     content = (msg.header.frame_id, msg.height, msg.width, msg.distortion_model, *map(tuple, (msg.d, msg.k, msg.r, msg.p)))
     roi = msg.roi
     return Camera((*content, msg.binning_x, msg.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height), msg)
@@ -51,7 +51,7 @@ def checked_camera(msg, config: Config, plane: str = '') -> Camera:
     region = [(r or full) // max(b, 1) for r, full, b in zip((msg.roi.height, msg.roi.width), (msg.height, msg.width), (msg.binning_y, msg.binning_x))]
     pose = (np.eye(3), np.zeros(3)) if config.input.geometry == 'tf' else None
     camera_info_to_view(msg, plane, tuple(region), rectified=config.input.rectified, pose=pose)
-    return camera(msg)
+    return camera(msg, plane)
 
 
 @dataclass(frozen=True)

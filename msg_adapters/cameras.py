@@ -22,12 +22,12 @@ class BadCameraInfo(ValueError):
     """A CameraInfo that can't be a camera, or not this image's; the message tells why."""
 
 
-def check_lengths(msg) -> None:
-    """Raises BadCameraInfo where what has no limit in a sensor_msgs/CameraInfo is too long to be kept, compared and repeated."""
+def check_lengths(msg, name: str) -> None:
+    """Raises BadCameraInfo where what has no limit in plane `name`'s sensor_msgs/CameraInfo is too long to be kept, compared and repeated."""
     if len(msg.header.frame_id) > LONGEST:
-        raise BadCameraInfo(f'its frame_id has {len(msg.header.frame_id)} characters, more than {LONGEST}')
+        raise BadCameraInfo(f'plane {name}: its frame_id has {len(msg.header.frame_id)} characters, more than {LONGEST}')
     if len(msg.d) > MOST_COEFFICIENTS:
-        raise BadCameraInfo(f'D has {len(msg.d)} coefficients, more than {MOST_COEFFICIENTS}')
+        raise BadCameraInfo(f'plane {name}: D has {len(msg.d)} coefficients, more than {MOST_COEFFICIENTS}')
 
 
 def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectified: bool = False, pose=None) -> View:

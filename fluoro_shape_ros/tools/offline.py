@@ -214,7 +214,7 @@ def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary, c
         if copy:
             copy(recorded, stamp)
         try:
-            entry = camera(recorded.message)
+            entry = camera(recorded.message, plane)
             if known[plane] and known[plane][-1][1] == entry:
                 entry = known[plane][-1][1]     # one object a camera, however often it was sent
             else:
