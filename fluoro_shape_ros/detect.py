@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .centerline import Candidate, find_candidates, find_ridges, ridge_scale, shrinking
+from .centerline import find_ridges, ridge_scale, shrinking
+from .chains import Candidate, find_candidates
 from .data import Outcome
 from .fit import Fit, continues, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
 from .start import first_curve
-from .strips import apparent_width, cut_along, half_width_range, pieces
+from .strips import apparent_width, cut_along, half_width_range, odd_width, pieces
 
 LINES = 14              # strongest lines of an image that are looked at closely
 CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...
@@ -22,7 +23,7 @@ HOPELESS = 0.03         # ... unless they are that much less like it than the be
 HYPOTHESES = 4          # alignments that are fitted before one is chosen
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
 UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
-USUAL_WIDTH, WIDTH_RATIO = 0.88, 0.3   # as wide as this, and natural logarithm of what it varies by: robot_radius, sharpness of the image
+ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less likely the device
 EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it
@@ -86,7 +87,8 @@ def candidates_of(image, field, half_width_px: float, min_length_px: float) -> l
         return []
     strips, of = cut_along(image, field, [line.points_px for line in lines], half_width_range(half_width_px))
     profiles = [pieces(strips.profiles, strips.inside & (of == k)) for k in range(len(lines))]
-    scored = [replace(line, score=alike_device(*apparent_width([p], [half_width_px]))) for line, p in zip(lines, profiles)]
+    seen = [apparent_width([p], [half_width_px]) for p in profiles]
+    scored = [replace(line, score=alike_device(odd_width(width, half_width_px), alike)) for line, (width, alike) in zip(lines, seen)]
     scored.sort(key=lambda c: -c.score * np.sqrt(len(c.z)))
     return [c for c in scored[:CANDIDATES] if c.score > HOPELESS * scored[0].score]
 
@@ -114,9 +116,9 @@ def evidence(f: Fit) -> float:
     alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.width, f.likeness))
+    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness))
 
 
-def alike_device(width: float, likeness: np.ndarray) -> float:
-    """At most 1: how device-like lines of this apparent width are, by their (V,) likeness with cylinders so wide."""
-    return float(np.exp((np.clip(likeness, 0, 1).mean() - 1) / UNLIKE - 0.5 * (np.log(width / USUAL_WIDTH) / WIDTH_RATIO) ** 2))
+def alike_device(odd: float, likeness: np.ndarray) -> float:
+    """At most 1: how device-like lines are, by their odd width and their (V,) likeness with cylinders of their own width."""
+    return float(np.exp((np.clip(likeness, 0, 1).mean() - 1) / UNLIKE - 0.5 * (odd / ODD_WIDTH) ** 2))

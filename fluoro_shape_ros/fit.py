@@ -16,7 +16,7 @@ from .extent import End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import Measurement, Strips, apparent_width, cut, half_width_range, mean_profile, measure, own_shadow, pieces, search, shadow
+from .strips import Measurement, Strips, apparent_width, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
 
 COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
@@ -49,6 +49,7 @@ class Fit:
     contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, after blur
     across: np.ndarray          # (2,) the same as if seen straight on, by Beer-Lambert
     width: float                # how many times as wide as a cylinder of robot_radius it looks
+    odd_width: float            # by how much that is more than usual, see strips.odd_width
     likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder so wide
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
 
@@ -60,17 +61,20 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
     """
     scale = [pixels_per_metre(v.P, points) for v in views]
     half_width = [radius * k for k in scale]
-    step, length = 1 / max(scale), arc_length(points)[-1]
-    if max(half_width) > MAX_HALF_WIDTH_PX or length > sum(v.width + v.height for v in views) * step or min(depth(v.P, points).min() for v in views) <= 0:
-        return None     # no start: it goes to a source, or out of the images and back
+    step = 1 / max(scale)
+    longest = step * sum(v.width + v.height for v in views)
+    if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
+        return None     # it goes to a source
     reach = half_width_range(max(half_width))
     template = _shadows(half_width, np.arange(-reach, reach + 1))
     spline = through(points, EXTENSION_PX * step)
-    reference = (0.0, length)
+    reference = (0.0, arc_length(points)[-1])
     grown, length_px = 0, 0.0
     rounds = [True] * coarse + [False] * FINE
     while rounds:
         wide = rounds.pop(0)
+        if not spline.stop - spline.start < longest:
+            return None     # it has left the images, or turns back and forth in them
         s = np.arange(spline.start, spline.stop, COARSE_STEP * step if wide else step)
         strips = cut(images, fields, views, spline(s), spline(s, 1), reach + WIDE_PX if wide else reach)
         within = (s >= reference[0]) & (s <= reference[1])
@@ -160,7 +164,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
             dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
             start_stop[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
     found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, np.linalg.inv(solution.information), s, presence, solution.offset_px.T,
-                contrast, across, width, alike, np.nan_to_num(beyond))
+                contrast, across, width, odd_width(width, float(np.mean(half_width))), alike, np.nan_to_num(beyond))
     return found, ends
 
 

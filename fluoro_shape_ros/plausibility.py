@@ -11,7 +11,7 @@ from .detect import evidence
 from .fit import Fit, contrast_ratio, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
-WIDTH = (0.6, 1.25)     # how many times as wide as robot_radius it may look: that may be off by a third, and images are not equally sharp
+MAX_ODD_WIDTH = 0.15    # see strips.odd_width: robot_radius may be off by a third
 MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
@@ -27,7 +27,7 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
     if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
         return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
-    if not WIDTH[0] < f.width < WIDTH[1]:
+    if f.odd_width > MAX_ODD_WIDTH:
         return Outcome.POORLY_EXPLAINED, f'it looks {f.width:.1f} times as wide as a device of robot_radius'
     ratio = contrast_ratio(f)
     if ratio > MAX_CONTRAST_RATIO:

@@ -17,6 +17,8 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 32              # strips
+USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
+WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
 WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
 
 
@@ -115,6 +117,15 @@ def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np
     alike = np.stack([np.median(likeness(p, h), axis=0) if len(p) else np.zeros(len(WIDTHS)) for p, h in zip(profiles, half_width_px)])
     best = int(alike.min(axis=0).argmax())
     return float(WIDTHS[best]), alike[:, best]
+
+
+def odd_width(width: float, half_width_px: float) -> float:
+    """By how much `width` (see `apparent_width`) is wider or narrower than a device of this half width ever looks, as a natural logarithm; 0 where it is not.
+
+    Images are not all equally sharp, which counts the more the fewer pixels there are.
+    """
+    ratio = np.log(width / USUAL_WIDTH)
+    return float(max(ratio - np.log1p(WIDER_PX / half_width_px), -ratio - np.log1p(NARROWER_PX / half_width_px), 0.0))
 
 
 def pieces(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:

@@ -11,7 +11,8 @@ from scipy.special import ndtr
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
-from fluoro_shape_ros.strips import WIDTHS, Measurement, Strips, cut, cut_along, half_width_range, likeness, mean_profile, measure, own_shadow, search, shadow
+from fluoro_shape_ros.strips import (
+    WIDTHS, Measurement, Strips, apparent_width, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -203,3 +204,14 @@ def test_strips_along_lines_of_pixels():
     assert np.ptp(strips.centers_px[of == 1, 0]) > 160
     planes = Strips(*(a if k == 'offsets_px' else a[None, of == 1] for k, a in vars(strips).items()))
     assert_allclose(measured(planes).offset_px * strips.normals[of == 1, 1], -0.15, atol=0.02)
+
+
+def test_how_wide_a_line_looks_and_when_that_is_odd():
+    for factor in (0.7, 1.0, 1.4):
+        image = draw((1, 0, 0), half_width=factor * HALF_WIDTH, noise=0.5)
+        strips = strips_of((1, 0, 0), image)
+        width, alike = apparent_width([pieces(strips.profiles[0], ALL)], [HALF_WIDTH])
+        assert width == pytest.approx(factor, rel=0.08) and alike[0] > 0.99
+    assert odd_width(0.88, 2.0) == odd_width(1.0, 2.0) == odd_width(0.7, 2.0) == 0
+    assert odd_width(1.5, 2.0) > odd_width(1.4, 2.0) > 0 and odd_width(0.4, 2.0) > 0
+    assert odd_width(1.5, 1.0) < odd_width(1.5, 2.0) < odd_width(1.5, 4.0)     # the fewer pixels, the less is known

@@ -96,10 +96,12 @@ def test_missed_pairs_do_no_harm(missed):
     assert is_right(answer, after) and same(answer.shape, search(after).shape)
 
 
-def test_nothing_is_found_where_the_device_was_and_is_no_more():
+def test_where_the_device_is_no_more_everything_is_searched():
     before, after = pictures([run().shape, moved(STEP)])
-    gone, back = reconstruct(run().without_device(), CONFIG, Prior(previous=search(before).shape)), follow([before, after])[1]
-    assert gone.shape is None and is_right(back, after)
+    empty, previous = run().without_device(), search(before).shape
+    gone = reconstruct(empty, CONFIG, Prior(previous=previous))
+    assert 'detect' in gone.stage_seconds and gone.outcome is reconstruct(empty, CONFIG).outcome
+    assert is_right(follow([after], previous)[0], after)
 
 
 def test_without_tracking_the_previous_shape_changes_nothing():
