@@ -278,6 +278,13 @@ def test_garbage_never_ends_in_another_error(tmp_path):
     assert named
 
 
+def test_without_pydicom_it_names_the_extra(files, monkeypatch, capsys):
+    for module in [name for name in sys.modules if name.split('.')[0] == 'pydicom']:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, 'pydicom', None)
+    assert 'needs pydicom' in (said := refused(capsys, 'a.dcm', 'b.dcm')) and 'fluoro_shape_ros[dicom]' in said
+
+
 @pytest.mark.parametrize('given', [['--dicom', 'a', 'b', '--plane-a', 'c'], ['--dicom', 'a'], ['--plane-a', 'a']])
 def test_either_files_or_dicom(given, capsys):
     with pytest.raises(SystemExit) as end:

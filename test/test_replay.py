@@ -350,11 +350,15 @@ def test_exit_codes_of_the_process(tmp_path, arguments, code):
     assert 'Traceback' not in done.stderr
 
 
-def test_without_rosbags_it_names_the_extra(run, tmp_path):
-    code = 'import sys\nsys.modules["rosbags"] = None\nfrom fluoro_shape_ros.tools.replay import main\nsys.exit(main())'
-    done = process(run, '--out', tmp_path / 'out', code=code)
-    assert done.returncode == 1
-    assert 'fluoro_shape_ros[bags]' in done.stderr and len(done.stderr.splitlines()) == 1
+@pytest.mark.parametrize('missing, extra, more', [('rosbags', 'bags', ()), ('mcap', 'bags', ()), ('plotly', 'report', ('--report', 'page.html'))])
+def test_what_is_not_installed_is_named_with_its_extra(run, tmp_path, capsys, monkeypatch, missing, extra, more):
+    for module in [name for name in sys.modules if name.split('.')[0] == missing]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert main(run, '--out', tmp_path / 'out', *more) == 1
+    error = capsys.readouterr().err
+    assert f'needs {missing}' in error and f'fluoro_shape_ros[{extra}]' in error and len(error.splitlines()) == 1
+    assert not (tmp_path / 'out').exists()
 
 
 def test_needs_no_ros(run, tmp_path):
