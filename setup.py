@@ -21,13 +21,15 @@ EXTRAS = {
     'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp')],
     'bags': ['rosbags>=0.10', 'mcap>=1.2', 'pyyaml>=6.0'],
     'report': ['plotly>=5.18'],
-    'dicom': ['pydicom>=3.0', 'python-gdcm>=3.0.24'],     # GDCM decodes the lossless JPEG that most angiographs write
+    'dicom': ['pydicom>=3.0.1', 'python-gdcm>=3.0.24.1'],     # GDCM decodes the lossless JPEG that most angiographs write
     'vtk': ['vtk>=9.3'],
     'plot': ['matplotlib>=3.6'],
 }
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
-EXTRAS['test'] = [*EXTRAS['all'], 'pytest>=7.4']
+# atheris has wheels for these only, and its sources need clang
+EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags']]
+EXTRAS['test'] = [*EXTRAS['all'], *EXTRAS['fuzz'], 'pytest>=7.4', 'hypothesis>=6.98']
 
 setup(
     name=NAME,

@@ -13,6 +13,8 @@ from scipy.linalg import rq
 from .data import Distortion, View
 
 MIN_PLANE_ANGLE = np.deg2rad(5.0)   # below it depth is a guess: triangulation errors grow as 1 / sin(angle)
+PARALLEL = np.deg2rad(1.0)          # central rays below it are meant not to meet
+STEREO_SHIFT = 0.25                 # of their width: how far apart the images of a stereo pair show what it looks at
 
 
 class GeometryError(ValueError):
@@ -59,14 +61,14 @@ def plane_angle(views: tuple[View, View]) -> float:
 
 
 def check_pair(views: tuple[View, View]) -> None:
-    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel without a baseline."""
+    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel without a baseline across."""
     sources = [source(v.P) for v in views]
-    baseline = np.linalg.norm(sources[0] - sources[1])
-    depth = max(np.linalg.norm(s) for s in sources) + 1e-3
+    apart = sources[1] - sources[0]
+    baseline, far = np.linalg.norm(apart), max(np.linalg.norm(s) for s in sources) + 1e-3
     if baseline < 1e-3:
         raise GeometryError(f'the sources of planes a and b coincide ({baseline * 1000:.2g} mm apart): no depth can be seen')
     # A rectified stereo pair has parallel axes but sees depth through its baseline; biplane sees it through the angle.
-    if plane_angle(views) < MIN_PLANE_ANGLE and baseline < 0.02 * depth:
+    if plane_angle(views) < MIN_PLANE_ANGLE and np.linalg.norm(np.cross(apart, views[0].P[2, :3])) < 0.02 * far:
         raise GeometryError(f'planes a and b are parallel ({np.rad2deg(plane_angle(views)):.2g} degrees): no depth can be seen')
 
 
@@ -94,13 +96,28 @@ def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
 
 
 def isocenter(views: tuple[View, View]) -> np.ndarray:
-    """(3,) m, the point nearest to both central rays (through the image centres): where a biplane system looks."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
+    """(3,) m, where two planes look: for a biplane system the point nearest to both central rays (through the image centres).
+
+    Those of a rectified stereo pair are parallel: it looks at the distance where its images are STEREO_SHIFT apart.
+    """
+    sources = np.stack([source(v.P) for v in views])
+    rays = np.stack([np.linalg.solve(v.P[:, :3], [(v.width - 1) / 2, (v.height - 1) / 2, 1.0]) for v in views])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    if np.linalg.norm(np.cross(*rays)) < np.sin(PARALLEL):
+        baseline = np.linalg.norm(np.cross(sources[1] - sources[0], rays[0]))
+        focal_px = np.sqrt(abs(np.linalg.det(views[0].P[:, :3])))
+        return sources.mean(axis=0) + rays[0] * focal_px * baseline / (STEREO_SHIFT * views[0].width)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    return np.linalg.lstsq(across.sum(axis=0), np.einsum('vij,vj->i', across, sources), rcond=None)[0]
+
+
+def check_scale(views: tuple[View, View], radius: float) -> None:
+    """Raises GeometryError where a device of `radius` (m) would be half as wide as an image, or wider, at the `isocenter`: no C-arm stands so near."""
     for v in views:
-        d = np.linalg.solve(v.P[:, :3], [(v.width - 1) / 2, (v.height - 1) / 2, 1.0])
-        across = np.eye(3) - np.outer(d, d) / (d @ d)
-        A, b = A + across, b + across @ source(v.P)
-    return np.linalg.lstsq(A, b, rcond=None)[0]
+        with np.errstate(divide='ignore'):
+            half_width_px = radius * pixels_per_metre(v.P, isocenter(views)[None])
+        if not half_width_px < min(v.width, v.height) / 4:
+            raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be {2 * half_width_px:.3g} px wide where the planes look')
 
 
 def fundamental(Pa: np.ndarray, Pb: np.ndarray) -> np.ndarray:
@@ -122,6 +139,7 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
     Starts at the linear solution (HZ 12.2) and takes Newton steps on the reprojection error (Gauss-Newton Hessian),
     all points at once. NaN where a point can't be triangulated.
     """
+    a_px, b_px = (np.where(np.abs(px) < 1e9, px, np.nan) for px in (a_px, b_px))    # farther away nothing can be told, and squares overflow
     A = np.stack([a_px[:, 0, None] * Pa[2] - Pa[0], a_px[:, 1, None] * Pa[2] - Pa[1],
                   b_px[:, 0, None] * Pb[2] - Pb[0], b_px[:, 1, None] * Pb[2] - Pb[1]], axis=1)
     bad = ~np.isfinite(A).all(axis=(1, 2))
@@ -129,7 +147,7 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         H = np.einsum('nij,nik->njk', A[:, :, :3], A[:, :, :3])
         g = np.einsum('nij,ni->nj', A[:, :, :3], A[:, :, 3])
-        bad |= np.abs(np.linalg.det(H / (np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-300))) < 1e-15
+        bad |= _singular(H)
         H[bad] = np.eye(3)
         X = -np.linalg.solve(H, g[..., None])[..., 0]
         for _ in range(iterations):
@@ -137,14 +155,18 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
             J = np.concatenate([projection_jacobian(Pa, X), projection_jacobian(Pb, X)], axis=1)
             H = np.einsum('nij,nik->njk', J, J)
             g = np.einsum('nij,ni->nj', J, r)
-            wild = ~np.isfinite(H).all(axis=(1, 2)) | ~np.isfinite(g).all(axis=1)
-            bad |= wild
+            bad |= _singular(H) | ~np.isfinite(g).all(axis=1)
             H[bad], g[bad] = np.eye(3), 0.0
             step = np.linalg.solve(H, g[..., None])[..., 0]
             X = X - step
             if np.abs(step).max(initial=0.0) < 1e-9:
                 break
     return np.where(bad[:, None], np.nan, X)
+
+
+def _singular(H: np.ndarray) -> np.ndarray:
+    """(N,) whether (N, 3, 3) positive semidefinite matrices have no inverse worth the name, or are not finite."""
+    return ~(np.linalg.det(H / (np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-300)) >= 1e-15)
 
 
 def undistort(view: View, points_px: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""What stamps decide: which images make a pair, and which camera holds for an image."""
+"""What stamps decide: which images make a pair."""
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -10,6 +10,7 @@ PLANES = ('a', 'b')
 JUMP_NS = 500_000_000   # farther back than this is no late frame: the stream has started anew (bag loop, simulator restart)
 BUFFER = 8              # images a plane that wait for a partner
 RECENT = 64             # stamps a plane among which a duplicate is known
+LAST_NS = (2**31 - 1) * 10**9   # of builtin_interfaces/Time, whose seconds are an int32
 
 
 @dataclass
@@ -20,7 +21,7 @@ class Counts:
     unpaired: int = 0       # given up: no partner within the slop, or overtaken by a newer pair
     out_of_order: int = 0   # older than a frame of the same plane before; counted beside what became of it
     duplicates: int = 0     # same plane, same stamp: the first one holds
-    unstamped: int = 0      # a stamp of zero says nothing about time and is never paired
+    unstamped: int = 0      # a stamp of zero (or one that no Time can hold) says nothing about time and is never paired
     jumps: int = 0          # how often the stamps of a plane jumped back and everything waiting was forgotten
 
 
@@ -73,7 +74,7 @@ class Pairer:
         A stamp more than JUMP_NS behind its plane's newest one resets the pairer and counts as a jump.
         """
         me, counts = self._planes[plane], self.counts
-        if stamp_ns <= 0:
+        if not 0 < stamp_ns <= LAST_NS:
             counts.unstamped += 1
             return None
         if me.newest is not None and stamp_ns < me.newest - JUMP_NS:
@@ -137,60 +138,3 @@ class Pairer:
         self.counts.pairs += 1
         self.counts.unpaired += a.drop(i + 1) + b.drop(j + 1) - 2
         return pair
-
-
-class CameraBook:
-    """Which camera holds for an image of one plane: the newest one stamped at or before it.
-
-    Only changes are kept. An image older than every camera takes the oldest known one.
-    """
-
-    def __init__(self):
-        self._stamps, self._cameras = [], []    # of the changes, by stamp
-        self._newest = None                     # stamp of the last camera, changed or not
-        self._asked = None                      # stamp of the last image
-        self._with_images = False               # whether cameras come with the images, stamp by stamp
-
-    def add(self, stamp_ns: int, camera) -> None:
-        """Take in a camera (anything that can be compared) that holds from `stamp_ns` on."""
-        if self._newest is not None and stamp_ns < self._newest - JUMP_NS:
-            self.rewind(stamp_ns)
-        self._newest = max(stamp_ns, self._newest or 0)
-        self._with_images |= stamp_ns == self._asked
-        k = bisect_right(self._stamps, stamp_ns)
-        if k == 0 or self._cameras[k - 1] != camera:
-            self._stamps.insert(k, stamp_ns)
-            self._cameras.insert(k, camera)
-            del self._stamps[:-BUFFER], self._cameras[:-BUFFER]
-
-    def at(self, stamp_ns: int):
-        """The camera that holds for an image, or None where none is known."""
-        if not self._cameras:
-            return None
-        return self._cameras[max(bisect_right(self._stamps, stamp_ns) - 1, 0)]
-
-    @property
-    def newest(self):
-        """The last camera, or None."""
-        return self._cameras[-1] if self._cameras else None
-
-    def awaits(self, stamp_ns: int) -> bool:
-        """Whether an image came before its camera: cameras have been coming with the images, but this one's is still on its way."""
-        self._asked = stamp_ns
-        self._with_images |= stamp_ns == self._newest
-        return self._with_images and self._newest < stamp_ns
-
-    def give_up(self) -> None:
-        """Cameras come no longer with the images: stop waiting for them, until they do again."""
-        self._with_images = False
-
-    def rewind(self, stamp_ns: int) -> None:
-        """The stamps jumped back to `stamp_ns`: forget later changes. With nothing else left, the newest camera goes on."""
-        if self._newest is None or self._newest <= stamp_ns:
-            return
-        last = self._cameras[-1]
-        k = bisect_right(self._stamps, stamp_ns)
-        del self._stamps[k:], self._cameras[k:]
-        if not self._cameras:
-            self._stamps, self._cameras = [stamp_ns], [last]
-        self._newest = stamp_ns - 1

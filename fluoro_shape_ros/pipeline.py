@@ -15,7 +15,7 @@ from .detect import detect, track
 from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
-from .geometry import GeometryError, check_pair, distort, pixels_per_metre, project, undistort
+from .geometry import GeometryError, check_pair, check_scale, distort, pixels_per_metre, project, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
 
@@ -28,6 +28,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
     clock = _Stopwatch()
     try:
         check_pair(frame.views)
+        check_scale(frame.views, config.detection.robot_radius)
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
     images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))

@@ -10,6 +10,7 @@ import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -24,15 +25,17 @@ from msg_adapters.shapes import BadPath, path_to_points
 from . import params
 from .config import ConfigError
 from .data import Frame, Outcome, Reconstruction
+from .limits import bounded
 from .outputs import Outputs
-from .pairing import PLANES, CameraBook, Pairer
+from .pairing import PLANES, Pairer
 from .pipeline import reconstruct
-from .subscriptions import AdaptiveSubscription, unheard
+from .subscriptions import AdaptiveSubscription, path_of, surviving, unheard
 from .transforms import TfMissing, TfPoses, import_tf
+from .waiting import CameraBook, Pair, WaitingRoom
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
-PATIENCE_S = 0.2        # for a camera info that should come with its image
+OVERDUE_S = 5.0         # a pair takes a fraction of a second; one that takes longer is told
 
 
 class FluoroShapeNode(Node):
@@ -44,7 +47,8 @@ class FluoroShapeNode(Node):
     def __init__(self):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
-        self._enabled, self._prediction, self._held, self._levels = True, None, None, None
+        self._enabled, self._prediction, self._levels, self._room = True, None, None, WaitingRoom()
+        self._overdue, self._senders = False, dict.fromkeys(PLANES, 0)
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
@@ -56,14 +60,15 @@ class FluoroShapeNode(Node):
         self._worker = Worker(self._work, self._failed)
         self._inputs = {}
         self._listen()
-        self.create_subscription(Path, 'predicted_backbone', self._on_prediction, QoSProfile(depth=1), qos_overriding_options=overridable)
+        self.create_subscription(Path, 'predicted_backbone', surviving(self._on_prediction, self._bug), QoSProfile(depth=1),
+                                 qos_overriding_options=overridable, raw=True)
         for name, kind, callback in (('reset', Trigger, self._on_reset), ('enable', SetBool, self._on_enable),
                                      ('capture_mask', Trigger, self._on_capture_mask), ('clear_mask', Trigger, self._on_clear_mask)):
             self.create_service(kind, f'~/{name}', callback)
         self.add_pre_set_parameters_callback(params.as_declared)
         self.add_on_set_parameters_callback(self._on_check_parameters)
         self.add_post_set_parameters_callback(self._on_parameters)
-        self.create_timer(1.0, self._on_second)
+        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))    # also while /clock stands still
 
     def stop(self, timeout_s: float) -> bool:
         """End the worker; whether it got to the end of its pair in time."""
@@ -85,13 +90,13 @@ class FluoroShapeNode(Node):
         # camera infos first: the executor takes them in this order, and an image needs its camera
         for plane in PLANES:
             self._inputs[f'camera info {plane}'] = AdaptiveSubscription(
-                self, CameraInfo, f'plane_{plane}/camera_info', partial(self._on_camera_info, plane), INFO_DEPTH, given.image_reliability)
+                self, CameraInfo, f'plane_{plane}/camera_info', surviving(partial(self._on_camera_info, plane), self._bug), INFO_DEPTH, given.image_reliability)
         for plane in PLANES:
             topic, kind = self.resolve_topic_name(f'plane_{plane}/image_raw'), Image
             if given.image_transport == 'compressed':   # beside the image wherever that was remapped to, as image_transport does it
                 topic, kind = f'{topic}/compressed', CompressedImage
             self._inputs[f'image {plane}'] = AdaptiveSubscription(
-                self, kind, topic, partial(self._on_image, plane), IMAGE_DEPTH, given.image_reliability)
+                self, kind, topic, surviving(partial(self._on_image, plane), self._bug), IMAGE_DEPTH, given.image_reliability)
 
     def _on_image(self, plane: str, msg) -> None:
         self._tally.event(f'image {plane}')
@@ -99,7 +104,7 @@ class FluoroShapeNode(Node):
             return
         stamp, arrived, counts = stamp_ns(msg), time.monotonic(), self._pairer.counts
         jumps, unstamped = counts.jumps, counts.unstamped
-        pair = self._pairer.add(plane, stamp, msg)
+        pair = self._pairer.add(plane, stamp, bounded(msg))
         if counts.unstamped > unstamped:
             self._tally.event('unstamped')
         if counts.jumps > jumps:
@@ -112,26 +117,31 @@ class FluoroShapeNode(Node):
                 self._lookup.forget()
         if pair is not None:
             self._tally.event('pair')
-            self._drop(self._held is not None)
-            self._held = *pair, arrived
+            stamp_a, image_a, image_b = pair
+            self._drop(self._room.add(Pair((stamp_a, stamp_ns(image_b)), (image_a, image_b), arrived)))
             self._hand_over()
         self._report_changes()
 
     def _on_camera_info(self, plane: str, msg) -> None:
-        book, known = self._books[plane], camera(msg)
+        book = self._books[plane]
         try:
+            known = camera(msg, plane)
             if known != book.newest:
                 known = checked_camera(msg, self._config, plane)
         except BadCameraInfo as error:
             self._tally.refused(f'camera info {plane}', str(error))
             self._report_changes()
-            return
-        self._tally.accepted(f'camera info {plane}')
+            if book.newest is None:
+                return
+            known = book.newest     # the one before holds, and no image need wait for this one
+        else:
+            self._tally.accepted(f'camera info {plane}')
         book.add(stamp_ns(msg), known)
         self._hand_over()
 
-    def _on_prediction(self, msg: Path) -> None:
+    def _on_prediction(self, data: bytes) -> None:
         try:
+            msg = path_of(data)
             self._prediction = Prediction(path_to_points(msg), msg.header.frame_id)
             self._tally.accepted('prediction')
         except BadPath as error:
@@ -140,28 +150,20 @@ class FluoroShapeNode(Node):
         self._report_changes()
 
     def _hand_over(self) -> None:
-        """Give the pair that is held to the worker, as soon as its cameras are known."""
-        if self._held is None:
-            return
-        stamp_a, image_a, image_b, arrived = self._held
-        stamps = stamp_a, stamp_ns(image_b)
-        waits = [self._books[plane].awaits(stamp) for plane, stamp in zip(PLANES, stamps)]
-        if any(waits) and time.monotonic() < arrived + PATIENCE_S:
-            return
-        for plane, late in zip(PLANES, waits):
-            if late:
-                self._books[plane].give_up()
-        self._held = None
-        cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, stamps))
-        self._drop(self._worker.offer(Job(stamp_a, (image_a, image_b), cameras, self._config, self._memory.generation, arrived, self._prediction)))
+        """Give the newest pair whose cameras are known to the worker."""
+        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic())
+        if pair is not None:
+            cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
+            lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, self._prediction))
+        self._drop(lost)
 
-    def _drop(self, dropped: bool) -> None:
-        if dropped:
+    def _drop(self, pairs: int) -> None:
+        for _ in range(pairs):
             self._tally.event('dropped')
 
     def _forget(self) -> None:
         """Nothing of what came before counts any more, but the cameras and the mask."""
-        self._held = None
+        self._room.clear()
         self._worker.clear()
         self._memory.reset()
 
@@ -236,7 +238,10 @@ class FluoroShapeNode(Node):
         return result
 
     def _failed(self, job: Job, error: Exception) -> None:
-        """A bug, in the worker's thread: said once, counted always."""
+        self._bug(error, time.monotonic() - job.arrived)
+
+    def _bug(self, error: Exception, latency_s: float = 0.0) -> None:
+        """An exception that nobody foresaw, in either thread: said once, counted always."""
         if not self.context.ok():   # what fails while the node goes down is no news
             return
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -244,19 +249,33 @@ class FluoroShapeNode(Node):
         if not self._tally.count(bug):
             self.get_logger().error(''.join(traceback.format_exception(error)))
         self._tally.event(bug)
-        self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}'), time.monotonic() - job.arrived)
+        self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}'), latency_s)
         self._answered.trigger()
 
     def _statuses(self) -> list:
         gap = self._pairer.gap_ns
         planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, unheard=partial(unheard, self._inputs, plane),
                                     reliability='best_effort' if self._inputs[f'image {plane}'].best_effort else 'reliable',
-                                    fell_back=self._inputs[f'image {plane}'].fell_back) for plane in PLANES]
+                                    fell_back=self._inputs[f'image {plane}'].fell_back,
+                                    publishers=self._senders[plane]) for plane in PLANES]
         pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)
         fault = self._tally.reason('prediction')
-        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}')))
-        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes)
+        clock = self.get_clock()
+        still = 'use_sim_time is set, but there is no /clock' if clock.ros_time_is_active and not clock.now().nanoseconds else ''
+        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still)))
+        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes,
+                                             overdue_s=self._overdue_s())
         return [*map(plane_status, planes), pairing_status(pairing), reconstruction_status(results)]
+
+    def _overdue_s(self) -> float:
+        """For how long the pair at work has been if that is too long, else 0; every such pair is counted once."""
+        busy = self._worker.busy_s
+        late = busy > OVERDUE_S
+        if late and not self._overdue:
+            self.get_logger().error(f'the pair at work takes more than {OVERDUE_S:g} s')
+            self._tally.event('overdue')
+        self._overdue = late
+        return busy if late else 0.0
 
     def _report(self, statuses) -> None:
         self._levels = _key(statuses)
@@ -268,6 +287,7 @@ class FluoroShapeNode(Node):
             self._report(statuses)
 
     def _on_second(self) -> None:
+        self._senders = {plane: self._inputs[f'image {plane}'].publishers for plane in PLANES}
         self._hand_over()
         self._report(self._statuses())
 

@@ -4,14 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from nav_msgs.msg import Path
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 
+from msg_adapters.shapes import BadPath
+
+MAX_PATH_BYTES = 2**18  # some 3000 poses; making Python objects of a million would keep the node busy for a minute
 RELIABILITIES = ('auto', 'reliable', 'best_effort')
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
+
+
+def surviving(callback: Callable, failed: Callable[[Exception], None]) -> Callable:
+    """`callback`, but an exception of it goes to `failed`: a message must not take the node with it."""
+    def call(msg):
+        try:
+            callback(msg)
+        except Exception as error:  # the last line of defence, see worker.Worker
+            failed(error)
+    return call
+
+
+def path_of(data: bytes) -> Path:
+    """The nav_msgs/Path in a serialized message. Raises BadPath where it is too long to be looked at, or damaged."""
+    if len(data) > MAX_PATH_BYTES:
+        raise BadPath(f'a Path of {len(data)} bytes; more than {MAX_PATH_BYTES} are not looked at')
+    try:
+        return deserialize_message(data, Path)
+    except RuntimeError as error:
+        raise BadPath('the Path is damaged') from error
 
 
 class AdaptiveSubscription:

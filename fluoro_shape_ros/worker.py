@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
+from msg_adapters.cameras import BadCameraInfo, camera_info_to_view, check_lengths
 from msg_adapters.diagnostics import Tally
 from msg_adapters.images import BadImage, compressed_to_array, image_to_array
 from msg_adapters.messages import stamp_ns
 
 from .config import Config
 from .data import Frame, Outcome, Prior, Reconstruction, Shape, View
+from .limits import Oversized
 from .pairing import PLANES
 
 
@@ -36,7 +38,9 @@ class Camera:
         return roi.x_offset, roi.y_offset, roi.width, roi.height, self.msg.binning_x, self.msg.binning_y
 
 
-def camera(msg) -> Camera:
+def camera(msg, plane: str = '') -> Camera:
+    """The camera of a plane's sensor_msgs/CameraInfo, unchecked but for its lengths. Raises BadCameraInfo where these are absurd."""
+    check_lengths(msg, plane)
     content = (msg.header.frame_id, msg.height, msg.width, msg.distortion_model, *map(tuple, (msg.d, msg.k, msg.r, msg.p)))
     roi = msg.roi
     return Camera((*content, msg.binning_x, msg.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height), msg)
@@ -47,7 +51,7 @@ def checked_camera(msg, config: Config, plane: str = '') -> Camera:
     region = [(r or full) // max(b, 1) for r, full, b in zip((msg.roi.height, msg.roi.width), (msg.height, msg.width), (msg.binning_y, msg.binning_x))]
     pose = (np.eye(3), np.zeros(3)) if config.input.geometry == 'tf' else None
     camera_info_to_view(msg, plane, tuple(region), rectified=config.input.rectified, pose=pose)
-    return camera(msg)
+    return camera(msg, plane)
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,8 @@ def decode(msg) -> np.ndarray:
     """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage, or of what was decoded before. Raises BadImage."""
     if isinstance(msg, np.ndarray):
         return msg
+    if isinstance(msg, Oversized):
+        raise BadImage(msg.reason)
     return image_to_array(msg) if hasattr(msg, 'encoding') else compressed_to_array(msg)
 
 
@@ -227,7 +233,7 @@ class Worker:
     def __init__(self, work: Callable[[Job], None], failed: Callable[[Job, Exception], None]):
         self._work, self._failed = work, failed
         self._changed = threading.Condition()
-        self._job, self._stopped = None, False
+        self._job, self._stopped, self._began = None, False, None
         self._thread = threading.Thread(target=self._run, name='reconstruction', daemon=True)
         self._thread.start()
 
@@ -242,6 +248,12 @@ class Worker:
         """Forget the job that waits, if any."""
         with self._changed:
             self._job = None
+
+    @property
+    def busy_s(self) -> float:
+        """How long the job at work has taken so far; 0 where there is none."""
+        began = self._began
+        return 0.0 if began is None else time.monotonic() - began
 
     def stop(self, timeout_s: float) -> bool:
         """Take no more jobs and wait for the one at work; whether it ended in time."""
@@ -258,7 +270,9 @@ class Worker:
                 if self._stopped:
                     return
                 job, self._job = self._job, None
+            self._began = time.monotonic()
             try:
                 self._work(job)
             except Exception as error:  # the last line of defence: a pair must not take the node with it
                 self._failed(job, error)
+            self._began = None

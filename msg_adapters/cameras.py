@@ -10,11 +10,24 @@ import numpy as np
 from fluoro_shape_ros.data import Distortion, View
 from fluoro_shape_ros.geometry import GeometryError, make_view
 
+from .messages import short
+
+LARGEST = 1e12      # no entry of a camera's matrices is beyond that, and arithmetic with it does not overflow
+LONGEST = 256       # characters of a frame_id, which every message of a result repeats
+MOST_COEFFICIENTS = 14      # that OpenCV knows
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}      # how many D may have
 
 
 class BadCameraInfo(ValueError):
     """A CameraInfo that can't be a camera, or not this image's; the message tells why."""
+
+
+def check_lengths(msg, name: str) -> None:
+    """Raises BadCameraInfo where what has no limit in plane `name`'s sensor_msgs/CameraInfo is too long to be kept, compared and repeated."""
+    if len(msg.header.frame_id) > LONGEST:
+        raise BadCameraInfo(f'plane {name}: its frame_id has {len(msg.header.frame_id)} characters, more than {LONGEST}')
+    if len(msg.d) > MOST_COEFFICIENTS:
+        raise BadCameraInfo(f'plane {name}: D has {len(msg.d)} coefficients, more than {MOST_COEFFICIENTS}')
 
 
 def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectified: bool = False, pose=None) -> View:
@@ -49,6 +62,8 @@ def _image_from_full(msg, image_shape: tuple[int, int]) -> np.ndarray:
         raise BadCameraInfo(f'its roi ({region[0]:g}x{region[1]:g} at {offset[0]:g}, {offset[1]:g}) leaves the sensor ({msg.width}x{msg.height})')
     binning = np.maximum([msg.binning_x, msg.binning_y], 1)     # 0: none
     width, height = (region // binning).astype(int)
+    if width < 1 or height < 1:
+        raise BadCameraInfo(f'its binning ({binning[0]}x{binning[1]}) leaves no pixel of {region[0]:g}x{region[1]:g}')
     if (height, width) != tuple(image_shape):
         raise BadCameraInfo(f'CameraInfo is for {width}x{height} images (roi and binning counted), but the image is {image_shape[1]}x{image_shape[0]}')
     # pixel centres lie at integers: u = (u_full - offset + 1/2) / binning - 1/2
@@ -81,6 +96,8 @@ def _finite(values, name: str) -> np.ndarray:
     m = np.array(values, float)
     if not np.isfinite(m).all():
         raise BadCameraInfo(f'{name} has entries that are not finite')
+    if np.abs(m).max(initial=0.0) > LARGEST:
+        raise BadCameraInfo(f'{name} has entries beyond {LARGEST:g}')
     return m
 
 
@@ -92,7 +109,7 @@ def _distortion(msg, K: np.ndarray) -> Distortion | None:
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise BadCameraInfo('R is no rotation')
     if model and model not in COEFFICIENTS:
-        raise BadCameraInfo(f'distortion model "{model}" is not one of {", ".join(COEFFICIENTS)}')
+        raise BadCameraInfo(f'distortion model "{short(model)}" is not one of {", ".join(COEFFICIENTS)}')
     if model and D.size and D.size not in COEFFICIENTS[model]:
         raise BadCameraInfo(f'{model} has {D.size} coefficients instead of {" or ".join(map(str, COEFFICIENTS[model]))}')
     if not model and D.any():

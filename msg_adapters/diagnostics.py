@@ -47,6 +47,7 @@ class PlaneSummary:
     reliability: str = 'reliable'   # in use
     fell_back: bool = False         # best-effort only because that is all a publisher offers
     unheard: Callable[[], str] = str    # names those of its topics that nobody publishes; asked only where it matters
+    publishers: int = 0             # of its images
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,8 @@ class ReconstructionSummary:
     warnings: tuple[str, ...] = ()  # of the last pair
     notes: tuple[str, ...] = ()     # what else went wrong lately
     silent_s: float | None = None   # since the last pair
+    overdue_s: float = 0.0          # for how long the pair at work has been, where that is too long
+    overdue: int = 0                # pairs that took too long
     rate_hz: float = 0.0            # of results
     latency_s: tuple[float, ...] = ()       # of the last results: second image's arrival to publication
     outcomes: dict[str, int] = field(default_factory=dict)
@@ -93,11 +96,13 @@ def plane_status(s: PlaneSummary) -> Status:
         level, message = ERROR, f'no camera info yet{_nobody(s)}'
     elif s.fell_back:
         level, message = WARN, 'best-effort is all the publisher offers: images may get lost'
+    elif s.publishers > 1:
+        level, message = WARN, f'{s.publishers} publishers on one image topic'
     else:
         level, message = OK, f'{s.rate_hz:.1f} images/s'
     return Status(f'plane {s.plane}', level, message, {
         'images': s.images, 'rate (1/s)': f'{s.rate_hz:.1f}', 'bad images': s.bad_images, 'bad camera infos': s.bad_camera_infos,
-        'camera info': 'known' if s.has_camera else 'none', 'reliability': s.reliability})
+        'camera info': 'known' if s.has_camera else 'none', 'reliability': s.reliability, 'publishers': s.publishers})
 
 
 def _nobody(s: PlaneSummary) -> str:
@@ -132,19 +137,21 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
     ms = [1e3 * x for x in s.latency_s]
     if not s.enabled:
         level, message = WARN, 'paused by ~/enable'
+    elif s.overdue_s:
+        level, message = ERROR, f'the pair at work takes {s.overdue_s:.0f} s already'
     elif s.capturing:
         level, message = OK, f'mask: {s.mask}'
     elif s.outcome is None:
         level, message = (WARN, '; '.join(s.notes)) if s.notes else (STALE, 'no pair yet')
     elif s.silent_s > WINDOW_S:
-        level, message = STALE, f'no pair for {s.silent_s:.0f} s; the last one: {reason}'
+        level, message = STALE, '; '.join((f'no pair for {s.silent_s:.0f} s; the last one: {reason}', *s.notes))
     elif s.outcome is not Outcome.OK:
         level, message = ERROR if s.outcome in FAULTS else WARN, '; '.join((reason, *s.notes))
     elif notes:
         level, message = WARN, '; '.join(notes)
     else:
         level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images' if ms else '')
-    values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask,
+    values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'overdue pairs': s.overdue,
               'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
     return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
 
@@ -233,7 +240,8 @@ class Tally:
             latency = tuple(value for _, value in self._recent(good, self._clock()))
             outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
         seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings)
-        return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes, **seen, **known)
+        return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes,
+                                     overdue=self.count('overdue'), **seen, **known)
 
     def _recent(self, name: str, now: float) -> deque:
         events = self._events.setdefault(name, deque(maxlen=1000))

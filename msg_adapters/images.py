@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .messages import New, header
+from .messages import New, header, short
 
 
 class BadImage(ValueError):
@@ -37,18 +37,25 @@ ENCODINGS = {
     'bgr8': _Encoding(_U8, 3, cv2.COLOR_BGR2GRAY),
     'rgb8': _Encoding(_U8, 3, cv2.COLOR_RGB2GRAY),
 }
-MAX_PIXELS = 2**26     # of a compressed image: 8192x8192; a small file may say it is of any size
+MAX_PIXELS = 2**24      # 4096 x 4096, finer than X-ray detectors are: reconstructing a pair of these takes some seconds and 1.2 GB
+MAX_PARTS = 2**16       # of a file, that are looked at: a PNG of that size has some thousand chunks
 _WRITTEN_AS = {(_U8, 2): 'mono8', (_U16, 2): 'mono16', (_F32, 2): '32FC1', (_U8, 3): 'bgr8'}     # by dtype and number of dimensions
+
+
+def check_pixels(height: int, width: int) -> None:
+    """Raises BadImage where an image has more than MAX_PIXELS."""
+    if height * width > MAX_PIXELS:
+        raise BadImage(f'{width}x{height} pixels are more than {MAX_PIXELS}')
 
 
 def image_to_array(msg) -> np.ndarray:
     """(H, W) uint8, uint16 or float32 in native byte order, from a sensor_msgs/Image.
 
     A read-only view of the message's memory where that is possible: one channel, native byte order, aligned.
-    Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, and values that are not finite.
+    Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, more than MAX_PIXELS, and values that are not finite.
     """
     if msg.encoding not in ENCODINGS:
-        raise BadImage(f'encoding "{msg.encoding}" is not one of {", ".join(ENCODINGS)}')
+        raise BadImage(f'encoding "{short(msg.encoding)}" is not one of {", ".join(ENCODINGS)}')
     encoding = ENCODINGS[msg.encoding]
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
     if height == 0 or width == 0:
@@ -60,6 +67,7 @@ def image_to_array(msg) -> np.ndarray:
     # the last row may come without its padding
     if not (height - 1) * step + width * item <= size <= height * step:
         raise BadImage(f'data has {size} bytes, but {height} rows of step {step} need {height * step}')
+    check_pixels(height, width)
     order = '>' if msg.is_bigendian else '<'
     strides = (step, item, encoding.dtype.itemsize)
     # np.ndarray rather than reshape: a step need not be a multiple of the item size
@@ -90,39 +98,64 @@ def compressed_to_array(msg) -> np.ndarray:
     """
     try:
         data = np.frombuffer(msg.data, np.uint8)
-        width, height = _announced_size(data)
-        if width * height > MAX_PIXELS:
-            raise BadImage(f'says it is {width}x{height} pixels, more than any X-ray detector has')
+        _check_announced(data)
         array = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
         if array is None:
             raise BadImage('can\'t be decoded')
     except cv2.error as error:
-        raise BadImage(f'{_name(msg)} can\'t be decoded: {error.err}') from error
+        raise BadImage(f'{_name(msg)}: can\'t be decoded: {error.err}') from error
     except BadImage as error:
-        raise BadImage(f'{_name(msg)} {error}') from None
+        raise BadImage(f'{_name(msg)}: {error}') from None
     return grey(array)
 
 
 def _name(msg) -> str:
-    return f'the compressed image (format "{msg.format[:60]}", {len(msg.data)} bytes)'
+    return f'the compressed image (format "{short(msg.format)}", {len(msg.data)} bytes)'
 
 
-def _announced_size(data: np.ndarray) -> tuple[int, int]:
-    """Width and height in the header of a PNG (ISO/IEC 15948, 11.2.2) or JPEG (ITU-T T.81, B.2.2); without decoding it."""
-    if data[:8].tobytes() == b'\x89PNG\r\n\x1a\n' and len(data) >= 24:
-        return struct.unpack('>II', data[16:24])
-    if data[:3].tobytes() != b'\xff\xd8\xff':
-        raise BadImage('is neither PNG nor JPEG')
+def _check_announced(data: np.ndarray) -> None:
+    """Raises BadImage, without decoding it, where a PNG or JPEG says that it is too large or ends too early, and for any other data."""
+    if data[:8].tobytes() == b'\x89PNG\r\n\x1a\n':
+        _check_png(data)
+    elif data[:3].tobytes() == b'\xff\xd8\xff':
+        _check_jpeg(data)
+    else:
+        raise BadImage('neither PNG nor JPEG')
+
+
+def _check_png(data: np.ndarray) -> None:
+    """All chunks (ISO/IEC 15948, 5.3 and 11.2.2): OpenCV makes room for whatever length one says it has, 2 GB for 80 bytes."""
+    at = 8
+    for _ in range(MAX_PARTS):
+        if at + 12 > len(data):
+            break
+        length, name = struct.unpack_from('>I4s', data, at)
+        if length > len(data) - at - 12:
+            break
+        if name == b'IHDR' and length >= 8:
+            width, height = struct.unpack_from('>II', data, at + 8)
+            check_pixels(height, width)
+        if name == b'IEND':
+            return
+        at += 12 + length
+    raise BadImage(f'a PNG that is cut short or damaged after {at} of {len(data)} bytes')
+
+
+def _check_jpeg(data: np.ndarray) -> None:
+    """The segments up to the start of the frame (ITU-T T.81, B.2.2), and whether there is an end."""
     at = 2
-    while at + 9 <= len(data) and data[at] == 0xff:
-        marker, length = struct.unpack('>BH', data[at + 1:at + 4])
+    for _ in range(MAX_PARTS):
+        if at + 9 > len(data) or data[at] != 0xff:
+            break
+        marker, length = struct.unpack_from('>BH', data, at + 1)
         if 0xc0 <= marker <= 0xcf and marker not in (0xc4, 0xc8, 0xcc):     # start of frame
+            height, width = struct.unpack_from('>HH', data, at + 5)
+            check_pixels(height, width)
             if data[at:].tobytes().rfind(b'\xff\xd9') < 0:      # end of image: without it, OpenCV 4 fills what is missing with grey
-                raise BadImage('is cut short')
-            height, width = struct.unpack('>HH', data[at + 5:at + 9])
-            return width, height
+                raise BadImage('a JPEG that is cut short')
+            return
         at += 1 if marker == 0xff else 2 + length
-    raise BadImage('has no complete JPEG header')
+    raise BadImage('no complete JPEG header')
 
 
 def grey(array: np.ndarray) -> np.ndarray:

@@ -100,6 +100,12 @@ def header(new: New, stamp_ns: int, frame_id: str):
     return new('std_msgs/msg/Header', stamp=new('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec), frame_id=frame_id)
 
 
+def short(text: str, length: int = 40) -> str:
+    """`text` for a message to people: a string from the network may have any length and any characters."""
+    text = ''.join(c if c.isprintable() else '?' for c in text[:length + 1])
+    return text if len(text) <= length else text[:length] + '...'
+
+
 def stamp_ns(msg) -> int:
     """The stamp of a message with a header, or of a header, in nanoseconds."""
     stamp = getattr(msg, 'header', msg).stamp

@@ -18,7 +18,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 ROWS_TRIED = 256                    # damaged rows in sequence after which nothing more is to be expected
-RECORD_LIMIT = 2**30                # bytes; a length beyond it is damage, not data
+SIZE_LIMIT = 2**30                  # bytes; what says that it is longer is damaged, or made to take all memory
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'    # no CDR message begins like this: compressed one by one
 
 _ROWS_AFTER = 'SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id'
@@ -52,7 +52,9 @@ class Salvage:
             for topic, kind, log_ns, raw in (mcap_messages if path.suffix == '.mcap' else sqlite_messages)(path):
                 if raw[:4] == ZSTD_MAGIC:
                     try:
-                        raw = zstandard.ZstdDecompressor().decompress(raw)
+                        if zstandard.frame_content_size(raw) > SIZE_LIMIT:
+                            continue
+                        raw = zstandard.ZstdDecompressor().decompress(raw, max_output_size=SIZE_LIMIT)
                     except zstandard.ZstdError:
                         continue
                 yield topic, kind, log_ns, raw
@@ -88,7 +90,7 @@ def mcap_messages(path: Path) -> Iterator[Raw]:
 
 def _mcap_records(path: Path) -> Iterator:
     with path.open('rb') as file:
-        records = StreamReader(io.BufferedReader(file), emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        records = StreamReader(io.BufferedReader(file), emit_chunks=True, record_size_limit=SIZE_LIMIT).records
         while True:
             try:
                 record = next(records, None)
@@ -97,10 +99,16 @@ def _mcap_records(path: Path) -> Iterator:
             if record is None:
                 return
             try:
-                parts = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+                parts = _parts(record) if isinstance(record, Chunk) else [record]
             except Exception:       # the same inside a chunk, but the next one stands by itself
                 continue
             yield from parts
+
+
+def _parts(chunk: Chunk) -> list:
+    """The records of a chunk; none where it says that it is too long."""
+    said = zstandard.frame_content_size(chunk.data) if chunk.compression == 'zstd' else 0
+    return [] if max(said, chunk.uncompressed_size) > SIZE_LIMIT else breakup_chunk(chunk, validate_crc=True)
 
 
 def sqlite_messages(path: Path) -> Iterator[Raw]:

@@ -9,7 +9,7 @@ from urllib.parse import unquote
 CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None)
 # no network; time runs only while the page has nothing to do; WebGL in software, as there need not be a graphics card
 OPTIONS = ('--headless', '--no-sandbox', '--disable-dev-shm-usage', '--no-first-run', '--use-angle=swiftshader', '--enable-unsafe-swiftshader',
-           '--host-resolver-rules=MAP * ~NOTFOUND', '--enable-logging=stderr', '--window-size=1400,1500', '--virtual-time-budget=60000')
+           '--host-resolver-rules=MAP * ~NOTFOUND', '--enable-logging=stderr', '--window-size=1400,1500', '--virtual-time-budget=300000')
 CATCH = '''<script>
 window.problems = [];
 window.onerror = message => { problems.push(String(message)); };

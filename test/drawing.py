@@ -3,11 +3,14 @@
 import cv2
 import numpy as np
 
+from fluoro_shape_ros.geometry import make_view
+from fluoro_shape_ros.sim import xray
 from msg_adapters.calibration import Calibration
 
 SIZE = 320                          # px, both ways
 K = np.array([[800.0, 0, (SIZE - 1) / 2], [0, 800.0, (SIZE - 1) / 2], [0, 0, 1]])
-TOLERANCE = 0.0025                  # m: a pixel is 1 mm, the line is drawn on whole pixels
+RADIUS = 1e-3                       # m, of the wire
+TOLERANCE = 0.0025                  # m: a pixel is 1 mm
 
 
 def curve():
@@ -23,16 +26,13 @@ def projection(angle):
     return K @ np.c_[np.stack([right, np.cross(forward, right), forward]), [0, 0, 0.8]]
 
 
-def draw(P, device=True):
-    """(SIZE, SIZE) uint8: a dark blurred line on a bright, even background."""
-    image = np.full((SIZE, SIZE), 180, np.uint8)
-    if device:
-        x = np.c_[curve(), np.ones(600)] @ P.T
-        cv2.polylines(image, [np.round(x[:, :2] / x[:, 2:] * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
-    return cv2.GaussianBlur(image, (5, 5), 0)
+def draw(P, size=SIZE, device=True, points=curve()):    # noqa: B008 (never changed)
+    """(size, size) uint8: the shadow of a round wire along (N, 3) points, blurred, on a bright, even background."""
+    wire = xray.transmission(points, RADIUS, make_view('a', P, size, size), xray.Exposure(contrast=0.7)) if device else np.ones((size, size), np.float32)
+    return np.rint(cv2.GaussianBlur(180 * wire, (5, 5), 0)).astype(np.uint8)
 
 
 VIEWS = [projection(0), projection(np.pi / 2)]
-GOOD, BLANK = ([draw(P, device) for P in VIEWS] for device in (True, False))
+GOOD, BLANK = ([draw(P, device=device) for P in VIEWS] for device in (True, False))
 CALIBRATIONS = [Calibration(f'plane_{p}', SIZE, SIZE, K, P, 'plumb_bob', np.zeros(5)) for p, P in zip('ab', VIEWS)]
 BASE = 'base_position=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])      # so that the tip is no guess

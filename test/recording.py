@@ -12,7 +12,7 @@ from msg_adapters.messages import stamp_ns
 SECOND = 10**9
 IMAGE, INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
 SKEW = 2_000_000        # of plane B's stamps, ns
-RADIUS = 'robot_radius=0.001'   # of the line drawn
+RADIUS = 'robot_radius=0.001'   # of what is drawn
 
 
 def record(path, pairs, storage='mcap', *, stamps=None, infos=True, spoil=lambda message: None, compressed=False):

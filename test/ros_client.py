@@ -9,10 +9,12 @@ import time
 from contextlib import contextmanager
 
 import cv2
+import drawing
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from drawing import SIZE, curve, draw
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import Parameter as ParameterMsg
@@ -20,24 +22,15 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
-SIZE = 320                          # px, both ways
-RADIUS = 'robot_radius:=0.001'      # of the line drawn
 STEP_NS = 66_000_000
 DOMAIN = 1 + 2 * (os.getpid() % 50)     # two runs on one machine do not meet
 OTHER = DOMAIN + 1                  # for a second node beside the first
-
-
-def curve():
-    """(600, 3) m, base to tip: 10 cm long, bent in space."""
-    s = np.linspace(0, 1, 600)
-    return np.c_[0.03 * np.sin(2.2 * s) - 0.01, 0.025 * (1 - np.cos(1.7 * s)) - 0.01, 0.09 * s - 0.045]
-
-
 BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])     # so that the tip is no guess
+RADIUS = f'robot_radius:={drawing.RADIUS}'
 
 
 def intrinsics(size=SIZE):
@@ -61,20 +54,6 @@ def projection(angle_deg, size=SIZE):
 def pose_at(plane, stamp_ns):
     """`pose` of plane 'a' or 'b' of a C-arm that turns by 20 degrees a second."""
     return pose(20 * stamp_ns / 1e9 + {'a': 0, 'b': 90}[plane])
-
-
-def draw(P, size=SIZE, device=True):
-    """(size, size) uint8: a dark blurred line on a bright, even background."""
-    x = np.c_[curve(), np.ones(600)] @ P.T
-    return draw_pixels(x[:, :2] / x[:, 2:], size, device)
-
-
-def draw_pixels(points_px, size=SIZE, device=True):
-    """The same line through (N, 2) pixels."""
-    image = np.full((size, size), 180, np.uint8)
-    if device:
-        cv2.polylines(image, [np.round(points_px * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
-    return cv2.GaussianBlur(image, (5, 5), 0)
 
 
 VIEWS = [projection(0), projection(90)]
@@ -145,13 +124,14 @@ class NodeProcess:
 class Client:
     """Publishes pairs and hears the answers; a context of its own."""
 
-    def __init__(self, reliability=ReliabilityPolicy.RELIABLE, compressed=False, start_ns=10**12, domain=DOMAIN):
+    def __init__(self, reliability=ReliabilityPolicy.RELIABLE, compressed=False, start_ns=10**12, domain=DOMAIN,
+                 durability=DurabilityPolicy.VOLATILE):
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node('client', enable_rosout=False, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        qos = QoSProfile(depth=10, reliability=reliability)
+        qos = QoSProfile(depth=10, reliability=reliability, durability=durability)
         kind, topic, self._message = (CompressedImage, 'image_raw/compressed', png_msg) if compressed else (Image, 'image_raw', image_msg)
         self.images = [self.node.create_publisher(kind, f'plane_{p}/{topic}', qos) for p in 'ab']
         self.infos = [self.node.create_publisher(CameraInfo, f'plane_{p}/camera_info', qos) for p in 'ab']

@@ -12,6 +12,7 @@ pytest.importorskip('rosbags')
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from msg_adapters import salvage
 from msg_adapters.bags import BadBag, absolute, create_bag, open_bag
 from msg_adapters.images import array_to_image, image_to_array
 from msg_adapters.messages import bag_message, stamp_ns
@@ -182,6 +183,21 @@ def test_compressed_bags_that_are_cut_off(tmp_path):
         cut(path, 0.9)
         stamps, damage = read_all(path)
         assert stamps == list(LONG)[:len(stamps)] and len(stamps) > 10 and damage, mode
+
+
+def test_what_would_take_all_memory_is_left_out(tmp_path, monkeypatch):
+    """Messages that say they are longer than a limit, here one of 1 KB, when they are unpacked."""
+    monkeypatch.setattr(salvage, 'SIZE_LIMIT', 1000)
+    types = get_typestore(Stores.ROS2_JAZZY)
+    for storage, mode in ((StoragePlugin.SQLITE3, CompressionMode.MESSAGE), (StoragePlugin.MCAP, CompressionMode.STORAGE)):
+        writer = Writer(tmp_path / storage.name, version=9, storage_plugin=storage)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            connection = writer.add_connection(TOPIC, 'sensor_msgs/msg/Image', typestore=types)
+            writer.write(connection, 11, types.serialize_cdr(array_to_image(PIXELS, 10, 'f', bag_message(types)), connection.msgtype))
+        (tmp_path / storage.name / 'metadata.yaml').unlink()
+        with pytest.raises(BadBag, match='can\'t be read as a bag'):
+            read_all(tmp_path / storage.name)
 
 
 def test_fewer_messages_than_announced_are_named(tmp_path):

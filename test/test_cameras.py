@@ -6,7 +6,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.geometry import distort, project, undistort
-from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
+from msg_adapters.cameras import BadCameraInfo, camera_info_to_view, check_lengths
+from msg_adapters.messages import header
 
 K = np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]])
 P = K @ np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]])     # looks along +z from z = -1 m
@@ -162,8 +163,18 @@ def test_a_rectified_image_has_none(info):
     (dict(distortion_model='plumb_bob', d=[0.1, 0, 0, np.nan]), 'D has entries that are not finite'),
     (dict(d=[0.1, 0, 0, 0]), 'no distortion model'),
     (dict(r=2 * np.eye(3)), 'R is no rotation'),
+    (dict(r=np.diag([1.3e154, 1, 1])), 'R has entries beyond 1e\\+12'),     # its square overflows, and NaN is not above any limit
+    (dict(binning_x=10**6), 'leaves no pixel'),
     (dict(r=np.diag([1.0, 1, -1])), 'R is no rotation'),
 ], ids=str)
 def test_what_can_not_be_a_camera_is_named(info, fields, says):
     with pytest.raises(BadCameraInfo, match=f'plane a: .*({says})'):
         view(info(**fields))
+
+
+@pytest.mark.parametrize('fields, says', [(dict(d=np.zeros(100_000)), 'D has 100000'), (dict(header='x' * 1000), 'frame_id has 1000 characters')], ids=['d', 'frame_id'])
+def test_what_would_be_kept_and_repeated_has_a_limit(info, new, fields, says):
+    fields = {k: header(new, 1, v) if k == 'header' else v for k, v in fields.items()}
+    check_lengths(info(), 'a')
+    with pytest.raises(BadCameraInfo, match=f'plane a: .*{says}'):
+        check_lengths(info(**fields), 'a')

@@ -34,6 +34,7 @@ def tally(clock):
     (PlaneSummary('a', silent_s=9.0, has_camera=True), STALE, 'no image for 9 s'),
     (PlaneSummary('a', unheard=lambda: '/plane_a/image_raw'), STALE, 'no image yet: nobody publishes /plane_a/image_raw'),
     (PlaneSummary('a', silent_s=0.1, unheard=lambda: '/plane_a/camera_info'), ERROR, 'no camera info yet: nobody publishes /plane_a/camera_info'),
+    (PlaneSummary('a', silent_s=0.1, has_camera=True, publishers=2), WARN, '2 publishers'),
     (PlaneSummary('a', silent_s=0.1, has_camera=True, fell_back=True), WARN, 'best-effort'),
     (PlaneSummary('a', silent_s=9.0, image_fault='too short'), ERROR, 'bad image: too short'),
     (PlaneSummary('a', silent_s=0.1, camera_fault='K is zero'), ERROR, 'camera info refused: K is zero'),
@@ -61,6 +62,8 @@ def test_pairing(summary, level, words):
 @pytest.mark.parametrize('summary, level, words', [
     (ReconstructionSummary(), STALE, 'no pair yet'),
     (ReconstructionSummary(enabled=False), WARN, 'paused'),
+    (ReconstructionSummary(outcome=Outcome.OK, silent_s=9.0, overdue_s=8.6), ERROR, 'takes 9 s already'),
+    (ReconstructionSummary(outcome=Outcome.OK, silent_s=9.0, notes=('no /clock',)), STALE, 'no /clock'),
     (ReconstructionSummary(capturing=True, mask='capturing, 3 of 8 pairs'), OK, '3 of 8'),
     (ReconstructionSummary(outcome=Outcome.OK, detail='ok', silent_s=0.1, rate_hz=4.0), OK, '4.0 results/s'),
     (ReconstructionSummary(outcome=Outcome.OK, silent_s=0.1, rate_hz=4.0, latency_s=(0.03, 0.04, 0.2)), OK, '4.0 results/s, 40 ms after'),

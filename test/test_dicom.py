@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip('rosbags')
 pytest.importorskip('mcap')
-pydicom = pytest.importorskip('pydicom', '3.0')
+pydicom = pytest.importorskip('pydicom', '3.0.1')
 
-from drawing import SIZE, curve                                             # noqa: E402
+from drawing import SIZE, curve, draw                                          # noqa: E402
 from pydicom.dataset import Dataset, FileMetaDataset                        # noqa: E402
 from pydicom.encaps import encapsulate                                      # noqa: E402
 from pydicom.uid import ExplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless, generate_uid    # noqa: E402
@@ -28,7 +28,6 @@ SID, SOD, PITCH = 1000.0, 750.0, 0.5        # mm
 WIDE = 4 / 3                                # mm, pitch of the detector on which the device is drawn
 PERSON = dict(PatientName='Secret^Somebody', PatientID='SECRET-0815', PatientBirthDate='19700102', InstitutionName='Secret Hospital',
               StudyDate='20260102', OperatorsName='Secret^Operator', StudyDescription='SECRET', ContentTime='121314')
-MIDDLE = (SIZE - 1) / 2
 
 
 def make(path, frames, primary=0.0, syntax=ExplicitVRLittleEndian, pixel_data=None, **attributes):
@@ -54,12 +53,11 @@ def make(path, frames, primary=0.0, syntax=ExplicitVRLittleEndian, pixel_data=No
 
 def seen(angle):
     """(SIZE, SIZE) uint8: the drawn device at primary angle 0 or 90, as the files show it; projected by hand."""
-    x, y, z = 1e3 * curve().T
-    depth, across = (SOD - y, x) if angle == 0 else (SOD + x, y)       # the source behind the patient, or at the right
-    uv = np.c_[MIDDLE + SID / WIDE * across / depth, MIDDLE - SID / WIDE * z / depth]
-    image = np.full((SIZE, SIZE), 180, np.uint8)
-    cv2.polylines(image, [np.round(uv * 16).astype(np.int32)], False, 60, 2, cv2.LINE_AA, 4)
-    return cv2.GaussianBlur(image, (5, 5), 0)
+    f, c, sod = SID / WIDE, (SIZE - 1) / 2, SOD / 1e3
+    if angle == 0:      # the source is behind the patient: depth sod - y, u with x, v against z
+        return draw(np.array([[f, -c, 0, c * sod], [0, -c, -f, c * sod], [0, -1, 0, sod]]))
+    # it is at the patient's right: depth sod + x, u with y, v against z
+    return draw(np.array([[c, f, 0, c * sod], [c, 0, -f, c * sod], [1, 0, 0, sod]]))
 
 
 BLANK = np.full((2, 8, 9), 7, np.uint16)
@@ -278,6 +276,13 @@ def test_garbage_never_ends_in_another_error(tmp_path):
             named += 1
             assert 'ecret' not in str(error) and '\n' not in str(error)
     assert named
+
+
+def test_without_pydicom_it_names_the_extra(files, monkeypatch, capsys):
+    for module in [name for name in sys.modules if name.split('.')[0] == 'pydicom']:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, 'pydicom', None)
+    assert 'needs pydicom' in (said := refused(capsys, 'a.dcm', 'b.dcm')) and 'fluoro_shape_ros[dicom]' in said
 
 
 @pytest.mark.parametrize('given', [['--dicom', 'a', 'b', '--plane-a', 'c'], ['--dicom', 'a'], ['--plane-a', 'a']])

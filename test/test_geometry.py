@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry import (GeometryError, check_pair, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
+from fluoro_shape_ros.geometry import (GeometryError, check_pair, check_scale, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
                                        pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
 
 K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])
@@ -103,7 +103,28 @@ def test_planes_that_see_no_depth_are_named():
     shifted[:, 3] += K @ [0.005, 0, 0]
     with pytest.raises(GeometryError, match='parallel'):
         check_pair((A, make_view('b', shifted, 101, 81)))
+    with pytest.raises(GeometryError, match='parallel'):     # sources that face each other
+        check_pair((A, make_view('b', K @ np.array([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 1]]), 101, 81)))
     check_pair((A, B))
+
+
+@pytest.mark.parametrize('z', [0.0, 1.0, -2.5])
+def test_a_stereo_pair_looks_to_where_its_images_are_a_quarter_apart_whatever_the_frame(z):
+    # 0.1 m apart: 1000 px * 0.1 m / distance = 101 px / 4
+    pair = tuple(make_view(name, K @ np.array([[1.0, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, z]]), 101, 81) for name, x in (('a', 0.0), ('b', -0.1)))
+    check_pair(pair)
+    check_scale(pair, 0.001)
+    assert_allclose(isocenter(pair), [0.05, 0, 400 / 101 - z], atol=1e-9)
+
+
+def test_a_source_where_the_planes_look_is_named():
+    """The device would be as wide as the image, and filters without end be made for it: 1000 px a radian, 81 px high, radius 20.25 mm at 1 m."""
+    check_scale((A, B), 0.0202)
+    with pytest.raises(GeometryError, match='plane a: a device of radius 20.3 mm would be 40.6 px wide'):
+        check_scale((A, B), 0.0203)
+    here = make_view('b', K @ np.array([[0, 0, -1.0, 0], [0, 1, 0, 0], [1, 0, 0, 0]]), 101, 81)
+    with pytest.raises(GeometryError, match='plane b: .* px wide'):
+        check_scale((A, here), 0.0006)
 
 
 @pytest.mark.parametrize('model, D', [('plumb_bob', [-0.2, 0.05, 1e-3, -2e-3, 0.01]), ('rational_polynomial', [0.3, 0.1, 0, 0, 0.02, 0.1, 0.05, 0.01]),

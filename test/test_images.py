@@ -165,9 +165,9 @@ JPEG = cv2.imencode('.jpg', np.arange(4096).reshape(64, 64).astype(np.uint8))[1]
     (b'', 'neither PNG nor JPEG'),
     (b'no image at all', 'neither PNG nor JPEG'),
     (bytes(12) + PNG, 'neither PNG nor JPEG'),      # as compressedDepth sends it
-    (PNG[:8], 'neither PNG nor JPEG'),
-    (PNG[:60], 'decoded'),
-    (PNG[:-20], 'decoded'),
+    (PNG[:8], 'cut short or damaged after 8 of 8 bytes'),
+    (PNG[:60], 'cut short or damaged'),
+    (PNG[:-20], 'cut short or damaged'),
     (PNG[:200] + bytes([PNG[200] ^ 255]) + PNG[201:], 'decoded'),
     (b'\xff\xd8\xff\xe0' + bytes(20), 'no complete JPEG header'),
     (JPEG[:len(JPEG) // 2], 'cut short'),

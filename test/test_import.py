@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip('rosbags')
 pytest.importorskip('yaml')
 
-from drawing import CALIBRATIONS, GOOD, SIZE                            # noqa: E402
+from drawing import CALIBRATIONS, GOOD, RADIUS, SIZE                            # noqa: E402
 
 from fluoro_shape_ros.tools import importer, replay                     # noqa: E402
 from fluoro_shape_ros.tools.cli import ToolError                        # noqa: E402
@@ -29,7 +29,9 @@ def folder(tmp_path, monkeypatch):
     for plane, pixels, calibration in zip('ab', GOOD, CALIBRATIONS):
         (tmp_path / plane).mkdir()
         for k in (2, 10):
-            cv2.imwrite(f'{plane}/frame{k}.png', np.where(np.eye(SIZE, dtype=bool), k, pixels).astype(np.uint8))
+            marked = pixels.copy()
+            marked[0, 0] = k
+            cv2.imwrite(f'{plane}/frame{k}.png', marked)
         write_calibration(f'{plane}.yaml', calibration)
     return tmp_path
 
@@ -70,7 +72,7 @@ def test_makes_the_bag_that_the_contract_names(folder, storage, capsys):
 
 def test_what_is_imported_replays(folder):
     assert importer.main(arguments('--frame-ids', 'left', 'right')) == 0
-    assert replay.main(['out', '--out', 'results']) == 0
+    assert replay.main(['out', '--out', 'results', '-p', f'robot_radius={RADIUS}']) == 0
     results = read('results')
     assert [log for log, _ in results['/tip']] == [SECOND, SECOND + round(SECOND / 15)]
     assert {m.header.frame_id for _, m in results['/backbone']} == {'left'}

@@ -237,8 +237,10 @@ def test_distortion_is_removed_unless_the_images_are_rectified(client):
     infos, pair = [], []
     for angle in (0, 90):
         R, t = ros.pose(angle)
+        px = cv2.projectPoints(ros.curve(), cv2.Rodrigues(R)[0], t, K, D)[0][:, 0]
+        bent = np.c_[px, np.ones(len(px))] @ np.linalg.inv(K).T * (ros.curve() @ R[2] + t[2])[:, None]     # as if a camera without distortion saw that
         infos.append(info_msg(ros.projection(angle), k=K.ravel(), d=D))
-        pair.append(ros.draw_pixels(cv2.projectPoints(ros.curve(), cv2.Rodrigues(R)[0], t, K, D)[0][:, 0]))
+        pair.append(ros.draw(K @ np.eye(3, 4), points=bent))
 
     def error():
         path, _ = client.answer(client.send_pixels(pair, infos=infos))

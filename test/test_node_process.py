@@ -39,7 +39,8 @@ def test_images_before_any_camera_info_a_qos_override_and_sigint(log):
         assert node.end(signal.SIGINT) == 0 and 'Traceback' not in node.log
 
 
-def test_sigterm_in_the_middle_of_a_pair(log):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT], ids=lambda s: s.name)
+def test_a_signal_in_the_middle_of_a_pair(log, number):
     """A pair that never ends: the worker's thread can't be joined."""
     code = """if True:
         import sys, threading
@@ -50,7 +51,7 @@ def test_sigterm_in_the_middle_of_a_pair(log):
     with NodeProcess(log, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected(), node.log
         assert client.insist(lambda: 'at work' in node.log)
-        assert node.end(signal.SIGTERM) == 0 and 'Traceback' not in node.log
+        assert node.end(number) == 0 and 'Traceback' not in node.log
 
 
 def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
@@ -125,6 +126,33 @@ def test_parameter_files_that_are_installed(tmp_path):
             taken = client.get(*values, node=f'/{name}/fluoro_shape')
             assert [list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)] == list(values.values()), name
         assert client.hears('no image yet: nobody publishes /defaults/plane_a/image_raw and /defaults/plane_a/camera_info')
+
+
+def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log):
+    code = """if True:
+        import sys, threading
+        import fluoro_shape_ros.pipeline as pipeline
+        from fluoro_shape_ros import ros_node
+        from fluoro_shape_ros.node import main
+        ros_node.OVERDUE_S = 1.0
+        real, told, bounded, left = pipeline.reconstruct, threading.Event(), ros_node.bounded, [0]
+        def long(*arguments):
+            told.wait(60)
+            return real(*arguments)
+        def buggy(msg):
+            return [][left.pop()] if left else bounded(msg)
+        def told_of(statuses, *rest, make=ros_node.diagnostic_array):
+            if any('takes' in s.message for s in statuses):
+                told.set()
+            return make(statuses, *rest)
+        ros_node.reconstruct, ros_node.bounded, ros_node.diagnostic_array = long, buggy, told_of
+        sys.exit(main())"""
+    with NodeProcess(log, BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+        assert client.connected()
+        assert client.insist(lambda: any('the pair at work takes' in s.message for s in client.statuses)), node.log
+        assert client.insist(lambda: client.paths), node.log
+        assert int(client.value('reconstruction', 'overdue pairs')) >= 1 and client.value('reconstruction', 'count internal_error') == '1'
+        assert node.log.count('Traceback') == 1 and 'IndexError' in node.log and 'takes more than' in node.log
 
 
 def run(*arguments, code=None):

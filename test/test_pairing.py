@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.pairing import BUFFER, JUMP_NS, CameraBook, Pairer
+from fluoro_shape_ros.pairing import BUFFER, JUMP_NS, LAST_NS, Pairer
 
 MS = 1_000_000
 T0 = 1_000_000 * MS
@@ -73,6 +73,13 @@ def test_zero_stamps_never_pair():
     pairer = Pairer(SLOP)
     assert pairer.add('a', 0, 1) is None and pairer.add('b', 0, 2) is None
     assert pairer.counts.unstamped == 2 and pairer.waiting == 0
+
+
+@pytest.mark.parametrize('stamp', [-1, LAST_NS + 1])
+def test_stamps_that_no_result_could_carry_never_pair(stamp):
+    pairer = Pairer(SLOP)
+    assert pairer.add('a', stamp, 1) is None and pairer.add('b', stamp, 2) is None
+    assert pairer.counts.unstamped == 2 and pairer.gap_ns is None
 
 
 def test_memory_is_bounded():
@@ -159,66 +166,3 @@ def test_in_order_every_image_gets_its_nearest_partner(seed):
     frames = sorted((stamps[p][k], p) for p in 'ab' for k in range(50) if keep[p][k])
     pairs = feed(Pairer(SLOP), [(p, float(ms)) for ms, p in frames])
     assert pairs == [(stamps['a'][k], stamps['b'][k]) for k in range(50) if keep['a'][k] and keep['b'][k]]
-
-
-def book(*cameras):
-    """A book that was given cameras as (ms, camera), in this order."""
-    b = CameraBook()
-    for ms, camera in cameras:
-        b.add(T0 + ms * MS, camera)
-    return b
-
-
-@pytest.mark.parametrize('cameras, ms, holds', [
-    ([], 0, None),
-    ([(0, 'x')], 0, 'x'),
-    ([(0, 'x')], 5000, 'x'),
-    ([(66, 'x')], 0, 'x'),                                          # the only one there is
-    ([(0, 'x'), (66, 'y')], 65, 'x'),                               # a change waits for the first image at or after it
-    ([(0, 'x'), (66, 'y')], 66, 'y'),
-    ([(66, 'y'), (0, 'x')], 65, 'x'),                               # late, but stamped before
-    ([(0, 'x'), (66, 'x'), (133, 'y')], 132, 'x'),
-    ([(0, 'x'), (0, 'y')], 0, 'y'),                                 # the same stamp: the later one
-    ([(20000, 'x'), (20066, 'y'), (0, 'z')], 30000, 'z'),           # a jump back: what was later is forgotten
-])
-def test_which_camera_holds(cameras, ms, holds):
-    assert book(*cameras).at(T0 + ms * MS) == holds
-
-
-def test_camera_memory_is_bounded():
-    b = book(*[(k, k) for k in range(400)])
-    assert b.at(T0 + 399 * MS) == 399 and b.at(T0) == 400 - BUFFER
-
-
-def test_an_image_waits_for_its_camera_only_where_cameras_come_with_images():
-    b = book((0, 'x'))
-    assert not b.awaits(T0 + 5)         # once and for all, as far as we know
-    b = book((0, 'x'))
-    assert not b.awaits(T0)             # stamped alike, so the next one will be, too
-    assert b.awaits(T0 + 66 * MS)
-    b.add(T0 + 66 * MS, 'y')
-    assert not b.awaits(T0 + 66 * MS) and b.at(T0 + 66 * MS) == 'y'
-
-
-def test_cameras_that_come_after_their_images_are_noticed():
-    b = book((0, 'x'))
-    assert not b.awaits(T0 + 66 * MS)
-    b.add(T0 + 66 * MS, 'y')
-    assert b.awaits(T0 + 133 * MS)
-
-
-def test_waiting_can_be_given_up_and_begins_again():
-    b = book((0, 'x'))
-    assert not b.awaits(T0) and b.awaits(T0 + 66 * MS)
-    b.give_up()
-    assert not b.awaits(T0 + 66 * MS) and not b.awaits(T0 + 133 * MS)
-    b.add(T0 + 200 * MS, 'x')
-    assert not b.awaits(T0 + 200 * MS) and b.awaits(T0 + 266 * MS)
-
-
-def test_after_images_jumped_back_a_known_camera_goes_on():
-    b = book((20000, 'x'), (20066, 'y'))
-    b.rewind(T0)
-    assert b.at(T0) == 'y' and b.at(T0 + 30000 * MS) == 'y'
-    b.add(T0 + 66 * MS, 'x')
-    assert (b.at(T0), b.at(T0 + 66 * MS)) == ('y', 'x')

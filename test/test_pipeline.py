@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Distortion, Frame, Outcome, Prior, Shape
-from fluoro_shape_ros.geometry import decompose, undistort
+from fluoro_shape_ros.geometry import decompose, make_view, undistort
 from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
@@ -200,6 +200,19 @@ def test_planes_of_different_moments_are_rejected(scene, config):
 def test_parallel_planes_are_no_geometry(scene, config):
     same = replace(scene.frame, views=(VIEWS[0], VIEWS[0]))
     assert reconstruct(same, config).outcome is Outcome.BAD_GEOMETRY
+
+
+@pytest.mark.parametrize('method', ['spline', 'paper'])
+def test_a_rectified_stereo_pair_in_the_frame_of_plane_a(method):
+    K, R, t = decompose(VIEWS[0].P)
+    baseline = 0.06
+    views = tuple(make_view(name, K @ np.c_[R, t + [x, 0, 0]], SIZE, SIZE) for name, x in (('a', baseline / 2), ('b', -baseline / 2)))
+    seen = xray_run(0, anatomy=False, **RUN | dict(views=views)).scene()
+    rectified = tuple(make_view(name, K @ np.c_[np.eye(3), [x, 0, 0]], SIZE, SIZE) for name, x in (('a', 0), ('b', -baseline)))
+    result = reconstruct(replace(seen.frame, views=rectified), Config.from_values(method=method))
+    assert result.outcome is Outcome.OK
+    truth = seen.truth @ R.T + t + [baseline / 2, 0, 0]
+    assert np.median(off(result.shape.points, truth)) < {'spline': 0.001, 'paper': 0.004}[method]
 
 
 def reversed_shape(shape):

@@ -94,18 +94,18 @@ def cluttered(pair):
     return [np.round(pixels * share).astype(np.uint8) for pixels, share in zip(pair, passed)]
 
 
-def test_the_first_seconds_as_mask(tmp_path, capsys):
-    """Without it the other wire is in the way; with it only the device is left. The pairs of the mask get no answer."""
+def test_the_first_seconds_as_mask(tmp_path, monkeypatch, capsys):
+    """Their pairs get no answer, and their mean goes along with every pair after them."""
+    masks, intact = [], offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: masks.append(prior.masks) or intact(frame, config, prior))
     record(tmp_path / 'run', [cluttered(BLANK), cluttered(BLANK), cluttered(GOOD), cluttered(GOOD)])
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', BASE, '--mask', 0.15) == 0
     assert outcomes(tmp_path / 'out') == {5_200_000_000: 'ok', 5_300_000_000: 'ok'}
     for _, path in read(tmp_path / 'out')['/backbone']:
         assert cKDTree(curve()).query(path_to_points(path))[0].max() < TOLERANCE
+    assert len(masks) == 2 and all(np.array_equal(seen, drawn) for pair in masks for seen, drawn in zip(pair, cluttered(BLANK)))
     said = capsys.readouterr().out
     assert '2  made the mask' in said and '2  ok' in said
-    main(tmp_path / 'run', '--out', tmp_path / 'bare', '-p', BASE)
-    found = [path_to_points(path) for _, path in read(tmp_path / 'bare')['/backbone']]
-    assert not any(cKDTree(points).query(curve())[0].max() < TOLERANCE for points in found)
 
 
 def test_a_mask_of_bad_images_is_none(tmp_path, capsys):
@@ -233,19 +233,20 @@ def test_no_camera_info(tmp_path):
     assert list(outcomes(tmp_path / 'out').values()) == ['no_camera_info']
 
 
-def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, capsys):
+@pytest.mark.parametrize('field, value, says', [('p', np.zeros(12), 'P is zero'), ('d', np.zeros(1000), 'D has 1000 coefficients')], ids=['p', 'd'])
+def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, capsys, field, value, says):
     with create_bag(tmp_path / 'run') as bag:
         for p, pixels, c in zip('ab', GOOD, CALIBRATIONS):
             bag.declare(f'/plane_{p}/image_raw', IMAGE)
             bag.declare(f'/plane_{p}/camera_info', INFO)
             good, bad = (calibration_to_camera_info(c, stamp, 'f', bag.new) for stamp in (SECOND, 2 * SECOND))
-            bad.p = np.zeros(12)
+            setattr(bad, field, value)
             for message in (good, bad):
                 bag.write(f'/plane_{p}/camera_info', message, stamp_ns(message))
             bag.write(f'/plane_{p}/image_raw', array_to_image(pixels, 3 * SECOND, 'f', bag.new), 3 * SECOND)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
     assert list(outcomes(tmp_path / 'out').values()) == ['ok']
-    assert 'camera infos refused: plane b: P is zero' in capsys.readouterr().out
+    assert f'camera infos refused: plane b: {says}' in capsys.readouterr().out
 
 
 def test_a_camera_holds_from_its_stamp_on():
@@ -349,11 +350,15 @@ def test_exit_codes_of_the_process(tmp_path, arguments, code):
     assert 'Traceback' not in done.stderr
 
 
-def test_without_rosbags_it_names_the_extra(run, tmp_path):
-    code = 'import sys\nsys.modules["rosbags"] = None\nfrom fluoro_shape_ros.tools.replay import main\nsys.exit(main())'
-    done = process(run, '--out', tmp_path / 'out', code=code)
-    assert done.returncode == 1
-    assert 'fluoro_shape_ros[bags]' in done.stderr and len(done.stderr.splitlines()) == 1
+@pytest.mark.parametrize('missing, extra, more', [('rosbags', 'bags', ()), ('mcap', 'bags', ()), ('plotly', 'report', ('--report', 'page.html'))])
+def test_what_is_not_installed_is_named_with_its_extra(run, tmp_path, capsys, monkeypatch, missing, extra, more):
+    for module in [name for name in sys.modules if name.split('.')[0] == missing]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert main(run, '--out', tmp_path / 'out', *more) == 1
+    error = capsys.readouterr().err
+    assert f'needs {missing}' in error and f'fluoro_shape_ros[{extra}]' in error and len(error.splitlines()) == 1
+    assert not (tmp_path / 'out').exists()
 
 
 def test_needs_no_ros(run, tmp_path):

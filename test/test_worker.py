@@ -231,6 +231,15 @@ def test_a_bug_is_reported_and_the_next_job_goes_on(worker, gate):
     assert gate.idle.wait(SECONDS) and gate.failed == [('bug', 'a bug')]
 
 
+def test_how_long_a_job_has_been_at_work_is_known(worker, gate):
+    assert worker.busy_s == 0
+    worker.offer('first')
+    assert gate.begun.wait(SECONDS)
+    before = worker.busy_s
+    gate.open.wait(0.01)
+    assert 0 < before < worker.busy_s
+
+
 def test_stopping_does_not_wait_for_ever(worker, gate):
     worker.offer('first')
     assert gate.begun.wait(SECONDS)

@@ -35,7 +35,8 @@ from ..worker import Camera, Job, Memory, adapt, camera, checked_camera, decode,
 from .cli import ToolError
 
 MAX_NS = 2**63 - 1
-AHEAD = 8       # images read before they are asked for
+LATE_NS = 10**9         # a camera info is not recorded later than this after the image for which it holds
+AHEAD = 8               # images read before they are asked for
 BAR = '{l_bar}{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]'
 Copy = Callable[[object, int], None]    # takes a Recorded and its stamp in ns
 
@@ -108,7 +109,7 @@ class Offline:
     def answers(self) -> Iterator[Answer]:
         """One answer a pair, in the order of the bag. Raises ToolError where no images pair."""
         cv2.setNumThreads(self._config.input.threads or -1)     # 0 would mean none for OpenCV
-        self._cameras = read_cameras(self._bag, self._config, self._topics.infos, self.summary, self._copy)
+        self._cameras = read_cameras(self._bag, self._config, self._topics.infos, self.summary, self._span[1], self._copy)
         span, summary = self._span, self.summary
         if self._mask_s:
             until_ns = self._bag.start_ns + round(self._mask_s * 1e9)
@@ -206,14 +207,16 @@ def _with_progress(pictures: Iterable[Picture], what: str, span: tuple[int, int]
             bar.update(min(max((picture.log_ns - span[0]) / 1e9, bar.n), total) - bar.n)
 
 
-def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary, copy: Copy | None = None) -> dict[str, list[tuple[int, Camera]]]:
-    """Plane to the valid cameras of the whole bag with their stamps, ascending; the others are noted in `summary`."""
+def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary, stop_ns: int = MAX_NS, copy: Copy | None = None
+                 ) -> dict[str, list[tuple[int, Camera]]]:
+    """Plane to the valid cameras of the bag up to a log time with their stamps, ascending; the others are noted in `summary`."""
     known = {plane: [] for plane in PLANES}
-    for recorded in bag.messages(infos):
-        plane, entry, stamp = infos[recorded.topic], camera(recorded.message), stamp_ns(recorded.message)
+    for recorded in bag.messages(infos, None, min(stop_ns + LATE_NS, MAX_NS)):
+        plane, stamp = infos[recorded.topic], stamp_ns(recorded.message)
         if copy:
             copy(recorded, stamp)
         try:
+            entry = camera(recorded.message, plane)
             if known[plane] and known[plane][-1][1] == entry:
                 entry = known[plane][-1][1]     # one object a camera, however often it was sent
             else:

@@ -27,7 +27,7 @@ from .parameters import NODE, read_parameters
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 DIAGNOSTICS = '/diagnostics'
 RESULTS = {     # topic -> type, adapter
-    'backbone': ('nav_msgs/msg/Path', shapes.shape_to_path),
+    'backbone': ('nav_msgs/msg/Path', None),    # is serialised at once
     'tip': ('geometry_msgs/msg/PointStamped', shapes.shape_to_tip),
     'tip_pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', shapes.shape_to_tip_pose),
     'backbone_points': ('sensor_msgs/msg/PointCloud2', shapes.shape_to_cloud),
@@ -201,7 +201,8 @@ class Results:
 
     def __init__(self, out, names: dict[str, str]):
         self._out = out
-        self._adapters = {names[name]: adapter for name, (_, adapter) in RESULTS.items()}
+        self._backbone = names['backbone']
+        self._adapters = {names[name]: adapter for name, (_, adapter) in RESULTS.items() if adapter}
         for name, (kind, _) in RESULTS.items():
             out.declare(names[name], kind)
         out.declare(DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray')
@@ -215,6 +216,7 @@ class Results:
                         {'last outcome': result.outcome.value, 'last detail': result.detail, 'warnings': ', '.join(result.warnings)})
         out.write(DIAGNOSTICS, diagnostic_array([status], stamp, NODE, out.new), stamp)
         if result.shape is not None:
+            out.write_raw(self._backbone, shapes.shape_to_path_cdr(result.shape, stamp, answer.job.frame_id), stamp)
             for topic, adapter in self._adapters.items():
                 out.write(topic, adapter(result.shape, stamp, answer.job.frame_id, out.new), stamp)
 

@@ -1,0 +1,168 @@
+"""Fuzz what reads bytes from elsewhere: `python test/fuzz.py TARGET --runs N`; atheris mutates messages and bags that are in order.
+
+Whatever the bytes, the adapter either reads them or refuses them by its own exception. Any other one ends the run with a traceback, exit
+code 77, and the bytes in a file crash-*; `python test/fuzz.py TARGET FILE` tries that again.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import atheris
+
+with atheris.instrument_imports(include=['msg_adapters', 'rosbags']):
+    import cv2
+    import numpy as np
+    from rosbags.typesys import Stores, get_typestore
+
+    from fluoro_shape_ros.config import Config
+    from fluoro_shape_ros.limits import bounded
+    from fluoro_shape_ros.worker import checked_camera, decode
+    from msg_adapters.bags import BadBag, create_bag, open_bag
+    from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
+    from msg_adapters.images import BadImage, array_to_image
+    from msg_adapters.messages import bag_message, header
+    from msg_adapters.shapes import BadPath, path_to_points
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+IMAGE, COMPRESSED, INFO, PATH = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Path'
+new = bag_message(TYPES)
+PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
+
+
+def message(data: bytes, kind: str):
+    """The message in serialized bytes, or None where the middleware would not have delivered it."""
+    try:
+        return TYPES.deserialize_cdr(data, kind)
+    except Exception:   # noqa: BLE001 - not ours: rosbags raises anything on damaged bytes, and BagReader answers for it
+        return None
+
+
+def serialized(msg, kind: str) -> bytes:
+    return bytes(TYPES.serialize_cdr(msg, kind))
+
+
+def image(data: bytes) -> None:
+    msg = message(data, IMAGE)
+    if msg is not None:
+        check_image(msg)
+
+
+def compressed_image(data: bytes) -> None:
+    check_image(new(COMPRESSED, format='png', data=np.frombuffer(data, np.uint8)))
+
+
+def check_image(msg) -> None:
+    try:
+        array = decode(bounded(msg))
+    except BadImage as error:
+        assert 0 < len(str(error)) < 400
+    else:
+        assert array.ndim == 2 and array.size and array.dtype in (np.uint8, np.uint16, np.float32)
+        assert array.dtype.kind == 'u' or np.isfinite(array).all()
+
+
+def camera_info(data: bytes) -> None:
+    msg = message(data, INFO)
+    if msg is None:
+        return
+    try:
+        checked_camera(msg, Config())
+        view = camera_info_to_view(msg, 'a', (6, 8))
+    except BadCameraInfo as error:
+        assert 0 < len(str(error)) < 400
+    else:
+        assert np.isfinite(view.P).all()
+
+
+def path(data: bytes) -> None:
+    msg = message(data, PATH)
+    if msg is None:
+        return
+    try:
+        points = path_to_points(msg)
+    except BadPath as error:
+        assert 0 < len(str(error)) < 400
+    else:
+        assert points.shape == (len(msg.poses), 3) and np.isfinite(points).all()
+
+
+def bag(data: bytes, suffix: str) -> None:
+    with tempfile.NamedTemporaryFile(suffix=suffix, dir=SCRATCH) as file:
+        file.write(data)
+        file.flush()
+        try:
+            with open_bag(file.name) as opened:
+                for recorded in opened.messages(list(opened.types())):
+                    assert recorded.message is not None
+        except BadBag as error:
+            assert str(error)
+
+
+def bag_mcap(data: bytes) -> None:
+    bag(data, '.mcap')
+
+
+def bag_db3(data: bytes) -> None:
+    bag(data, '.db3')
+
+
+TARGETS = {f.__name__: f for f in (image, compressed_image, camera_info, path, bag_mcap, bag_db3)}
+ONE_OF = [name for name in TARGETS for _ in range(1 if name.startswith('bag') else 8)]      # bags take a hundred times as long
+SCRATCH = '/dev/shm' if Path('/dev/shm').is_dir() else None
+
+
+def everything(data: bytes) -> None:
+    """The first byte says which target gets the rest: a short run of all in one process."""
+    if data:
+        TARGETS[ONE_OF[data[0] % len(ONE_OF)]](data[1:])
+
+
+def good_info():
+    K = np.array([[100.0, 0, 4], [0, 100, 3], [0, 0, 1]])
+    return new(INFO, header=header(new, 1, 'plane'), height=6, width=8, distortion_model='plumb_bob', d=np.zeros(5), k=K, r=np.eye(3), p=K @ np.eye(3, 4))
+
+
+def seeds(target: str) -> list[bytes]:
+    """Bytes that are in order, to begin with."""
+    pictures = [PIXELS, PIXELS * np.uint16(999), PIXELS.astype(np.float32), np.dstack([PIXELS] * 3)]
+    if target == 'everything':
+        return [bytes([ONE_OF.index(name)]) + data for name in TARGETS for data in seeds(name)]
+    if target == 'image':
+        return [serialized(array_to_image(p, 1, 'plane', new), IMAGE) for p in pictures]
+    if target == 'compressed_image':
+        return [cv2.imencode(suffix, p)[1].tobytes() for suffix, p in (('.png', pictures[0]), ('.png', pictures[1]), ('.jpg', pictures[0]), ('.jpg', pictures[3]))]
+    if target == 'camera_info':
+        return [serialized(good_info(), INFO)]
+    if target == 'path':
+        return [serialized(new(PATH, header=header(new, 1, 'cell'), poses=[new('geometry_msgs/msg/PoseStamped') for _ in range(n)]), PATH) for n in (0, 3)]
+    storage, suffix = ('sqlite3', '.db3') if target == 'bag_db3' else ('mcap', '.mcap')
+    with tempfile.TemporaryDirectory() as folder:
+        with create_bag(Path(folder) / 'bag', storage) as out:
+            out.declare('/info', INFO)
+            out.write('/info', good_info(), 5)
+        return [next((Path(folder) / 'bag').glob('*' + suffix)).read_bytes()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog='fuzz.py', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('target', choices=[*TARGETS, 'everything'])
+    parser.add_argument('file', nargs='?', help='try the bytes of this file once, instead of fuzzing')
+    parser.add_argument('--runs', type=int, default=1_000_000, help='how many executions (default: %(default)s)')
+    parser.add_argument('--seed', type=int, default=1, help='of the mutations (default: %(default)s)')
+    args = parser.parse_args()
+    target = TARGETS.get(args.target, everything)
+    if args.file:
+        target(Path(args.file).read_bytes())
+        return
+    with tempfile.TemporaryDirectory() as corpus:
+        for k, data in enumerate(seeds(args.target)):
+            (Path(corpus) / str(k)).write_bytes(data)
+        atheris.Setup([sys.argv[0], corpus, f'-runs={args.runs}', f'-seed={args.seed}', '-max_len=65536', '-rss_limit_mb=1024', '-timeout=20', '-verbosity=1'],
+                      target)
+        atheris.Fuzz()      # does not return
+
+
+if __name__ == '__main__':
+    main()
