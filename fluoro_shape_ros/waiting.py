@@ -10,7 +10,7 @@ from .pairing import JUMP_NS
 
 BUFFER = 8              # changes of a plane's camera that are known, pairs that wait for their cameras
 RECENT = 64             # stamps of cameras that are known
-PATIENCE_S = 2.0        # for a camera info that should come with its image
+PATIENCE_S = 4.0        # for a camera info that should come with its image: what the middleware lost, it sends again within 3 s
 
 
 class CameraBook:
