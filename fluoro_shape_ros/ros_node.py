@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import deque
 from functools import lru_cache, partial
 
 import cv2
@@ -27,10 +28,12 @@ from .data import Frame, Outcome, Reconstruction
 from .outputs import Outputs
 from .pairing import PLANES, CameraBook, Pairer
 from .pipeline import reconstruct
+from .prior import newest
 from .subscriptions import AdaptiveSubscription, transform_lookup
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
+PREDICTIONS = 256       # that are kept: a model may tell them faster than images come
 PATIENCE_S = 0.2        # for a camera info that should come with its image
 
 
@@ -43,7 +46,8 @@ class FluoroShapeNode(Node):
     def __init__(self):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
-        self._enabled, self._prediction, self._held, self._levels = True, None, None, None
+        self._enabled, self._held, self._levels = True, None, None
+        self._predictions = deque(maxlen=PREDICTIONS)
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
@@ -129,10 +133,9 @@ class FluoroShapeNode(Node):
 
     def _on_prediction(self, msg: Path) -> None:
         try:
-            self._prediction = Prediction(path_to_points(msg), msg.header.frame_id)
+            self._predictions.append(Prediction(path_to_points(msg), msg.header.frame_id, stamp_ns(msg)))
             self._tally.accepted('prediction')
         except BadPath as error:
-            self._prediction = None
             self._tally.refused('prediction', str(error))
         self._report_changes()
 
@@ -150,7 +153,8 @@ class FluoroShapeNode(Node):
                 self._books[plane].give_up()
         self._held = None
         cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, stamps))
-        self._drop(self._worker.offer(Job(stamp_a, (image_a, image_b), cameras, self._config, self._memory.generation, arrived, self._prediction)))
+        prediction = newest(self._predictions, stamp_a)
+        self._drop(self._worker.offer(Job(stamp_a, (image_a, image_b), cameras, self._config, self._memory.generation, arrived, prediction)))
 
     def _drop(self, dropped: bool) -> None:
         if dropped:
@@ -158,6 +162,7 @@ class FluoroShapeNode(Node):
 
     def _forget(self) -> None:
         """Nothing of what came before counts any more, but the cameras and the mask."""
+        self._predictions.clear()
         self._held = None
         self._worker.clear()
         self._memory.reset()
@@ -225,7 +230,7 @@ class FluoroShapeNode(Node):
         window = image_window(job, frame)
         if self._memory.take_for_mask(frame, window):
             return None
-        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window, self._tally))
+        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window))
         if not self._memory.remember(job, frame, result):
             return None
         self._outputs.answer(frame, result)

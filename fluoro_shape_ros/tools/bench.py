@@ -11,6 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..config import fields
+from . import bench_prior
 from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
@@ -35,7 +36,20 @@ def main(argv=None) -> int:
     timing.add_argument('--rounds', type=_count, default=10, metavar='N', help='how often each is timed (default: 10)')
     timing.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
     timing.set_defaults(body=_speed)
+    prior = commands.add_parser('prior', help='what a predicted_backbone is worth on the first pair, good or wrong')
+    prior.add_argument('--families', nargs='+', metavar='NAME', choices=[*ACCURACY, *ROBUSTNESS], default=list(bench_prior.FAMILIES),
+                       help=f'see accuracy and robustness (default: {" ".join(bench_prior.FAMILIES)})')
+    prior.add_argument('--scenes', type=_count, default=10, metavar='N', help='scenes of each family (default: 10)')
+    prior.add_argument('--rounds', type=_count, default=3, metavar='N', help='how often each is timed (default: 3)')
+    prior.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    prior.set_defaults(body=_prior)
     return run(lambda args: args.body(args, parser), parser, argv)
+
+
+def _prior(args, parser: argparse.ArgumentParser) -> int:
+    """Print the table of predictions."""
+    print(bench_prior.report(args.families, args.scenes, args.first_seed, args.rounds))
+    return 0
 
 
 def _speed(args, parser: argparse.ArgumentParser) -> int:
