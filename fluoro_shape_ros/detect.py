@@ -70,9 +70,9 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     return Detection(fitted, Outcome.OK, 'ok', seen)
 
 
-def track(images, fields, views, radius: float, points: np.ndarray, coarse: int = 1) -> Detection | None:
+def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
-    fitted = fit(images, fields, views, points, radius, coarse)
+    fitted = fit(images, fields, views, points, radius, coarse=1)
     if fitted is None or evidence(fitted, LENIENT) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
         return None
     ends = np.linspace(fitted.start, fitted.stop, 100)

@@ -13,7 +13,6 @@ from scipy.ndimage import gaussian_filter1d
 from .config import Config
 from .curve import resample
 from .detect import Detection, track
-from .fit import COARSE
 from .geometry import distort, fundamental, pixels_per_metre, project, undistort
 from .matching import align
 from .plausibility import check_fit
@@ -28,8 +27,9 @@ STRONGEST = 6.0         # noise deviations: a darker strip speaks no louder, it 
 BEND_COST = 1.0         # of a shift that changes by a pixel from a strip to the next ...
 TRUST = 0.15            # ... and what the prediction counts in each strip: its error is the same in many
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
-SHARP = 1e-3            # m: an end less certain than this may be another one
-SHORTEST = 10           # strips of a path that is worth a try
+SHORTEST = 0.6          # share of the strips ...
+SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
+SHARP = 0.35e-3         # m: an end less certain than this may be another one
 
 
 def found_near(guess: Guess, images, fields, views, config: Config) -> Detection | None:
@@ -38,7 +38,9 @@ def found_near(guess: Guess, images, fields, views, config: Config) -> Detection
     images, fields: (H, W) float32 (dark device, even noise; needed only within reach_px) and uint8, a pair each.
     """
     start = follow(images, fields, views, guess, config.detection.robot_radius)
-    found = None if start is None else track(images, fields, views, config.detection.robot_radius, start, coarse=COARSE)
+    if start is None or not borne_out(start, guess):
+        return None
+    found = track(images, fields, views, config.detection.robot_radius, start)
     if found is None:
         return None
     f = found.fit
@@ -76,8 +78,9 @@ def _path(image: np.ndarray, field: np.ndarray, view, guess: Guess, radius: floa
     score = strength - TRUST * (shifts / sigma_px[:, None]) ** 2 / 2
     score[np.abs(shifts) > WITHIN * sigma_px[:, None]] = -np.inf
     best = _most_probable(score)
-    start, stop = _darkest_stretch(strength[np.arange(len(best)), best] - CLEAR)
-    if stop - start < SHORTEST:
+    gain = strength[np.arange(len(best)), best] - CLEAR
+    start, stop = _darkest_stretch(gain)
+    if stop - start < SHORTEST * len(best) or (gain[start:stop] > 0).mean() < SEEN:
         return None
     shift = gaussian_filter1d(shifts[best[start:stop]], 3.0, mode='nearest')
     return undistort(view, centers[start:stop] + shift[:, None] * normals[start:stop])
