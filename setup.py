@@ -13,6 +13,7 @@ EXECUTABLES = {
     'fluoro_shape_replay': 'fluoro_shape_ros.tools.replay',
     'fluoro_shape_bench': 'fluoro_shape_ros.tools.bench',
     'fluoro_shape_demo': 'fluoro_shape_ros.tools.demo',
+    'fluoro_shape_servo_demo': 'fluoro_shape_ros.tools.servo_demo',
 }
 
 # real ROS 2 Jazzy as wheels; where ROS is installed (or there are no wheels) the extra is empty
@@ -42,7 +43,7 @@ setup(
     packages=find_packages(include=[f'{NAME}*', 'msg_adapters*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml', *sorted(glob('resource/*.xml') + glob('resource/*.yaml') + glob('resource/*.rviz') + glob('resource/*.json'))]),
+        (f'share/{NAME}', ['package.xml', *sorted(glob('resource/*.xml') + glob('resource/*.yaml') + glob('resource/*.rviz') + glob('resource/*.json') + glob('resource/*.py'))]),
         # `ros2 run` looks in lib/<package>; pip puts the entry points below in bin/ only
         (f'lib/{NAME}', [f'resource/bin/{name}' for name in EXECUTABLES]),
     ],
