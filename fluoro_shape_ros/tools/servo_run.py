@@ -79,7 +79,7 @@ def run(args, seed: int) -> Run:
     with contextlib.ExitStack() as stack:
         children = {name: stack.enter_context(child(arguments, args.out / f'{name}.log')) for name, arguments in commands(args, seed).items()}
         course = Course(stack.enter_context(Referee()), children, args.out)
-        course.until(lambda: course.record.measured)
+        course.until(lambda: course.record.measured and course.referee.now)
         ends, square = [], None
         if args.square:
             square = course.along(_square(next(iter(course.record.measured.values())), args.square), args.blackout)
