@@ -34,7 +34,7 @@ class Controller(Node):
         if q is None or self.target is None or max(self.joints) - self.seen > self.patience:
             return
         error = self.target - [msg.point.x, msg.point.y, msg.point.z]
-        error *= min(0.5, 0.0025 / max(np.linalg.norm(error), 1e-9))        # half of it in one go, but no more than 2.5 mm
+        error *= min(0.35, 0.003 / max(np.linalg.norm(error), 1e-9))        # a third of it in one go, but no more than 3 mm
         J = jacobian(self.robot, q) * self.speed                            # damped least squares; faster joints do more
         step = self.speed * (J.T @ np.linalg.solve(J @ J.T + 0.002**2 * np.eye(3), error))
         self.command.publish(JointState(header=msg.header, position=(q + step).tolist()))

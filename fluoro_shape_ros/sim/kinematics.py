@@ -16,6 +16,9 @@ from scipy.spatial.transform import Rotation
 from .shapes import STEP, Pose, Section, chain
 
 
+COARSE = 5e-3       # m: arcs are exact, so a backbone in coarse steps has the same tip
+
+
 @dataclass(frozen=True)
 class Joint:
     """What an actuator can do."""
@@ -114,7 +117,8 @@ class TendonRobot:
 def jacobian(robot: TubeRobot | TendonRobot, q: np.ndarray) -> np.ndarray:
     """(3, n) how the tip moves with each joint, m a unit: central differences."""
     steps = np.array([1e-4 * (joint.high - joint.low) for joint in robot.joints])
-    return np.stack([(robot.backbone(q + d)[-1] - robot.backbone(q - d)[-1]) / (2 * h) for h, d in zip(steps, np.diag(steps))], axis=1)
+    tips = [[robot.backbone(q + sign * d, COARSE)[-1] for sign in (1, -1)] for d in np.diag(steps)]
+    return np.stack([(ahead - behind) / (2 * h) for h, (ahead, behind) in zip(steps, tips)], axis=1)
 
 
 def limited(joints: Sequence[Joint], q: np.ndarray) -> np.ndarray:

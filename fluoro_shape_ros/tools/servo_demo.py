@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..sim.plant import MODEL_ERROR, ROBOTS
+from ..sim.plant import MODEL_ERROR, ROBOTS, plant
 from . import cli
 
 TOLERANCE = 0.3e-3      # m, in which the true tip has to end
@@ -68,7 +68,8 @@ def _run(args) -> int:
     for k in range(args.runs):
         runs.append(run(args, args.seed + k))
         print(line(runs[-1], args.rate), flush=True)
-    print(f'picture     {draw(runs[0], args.out / "servo.png", args.robot)}', flush=True)
+    moved = plant(args.robot, args.seed, args.size, not args.no_anatomy)
+    print(f'picture     {draw(runs[0], args.out / "servo.png", moved)}', flush=True)
     missed = sum(r.final.max() > TOLERANCE for r in runs)
     if missed:
         raise cli.ToolError(f'{missed} of {len(runs)} runs ended farther than {TOLERANCE * 1e3:g} mm from a target')

@@ -6,27 +6,40 @@ from pathlib import Path
 
 import numpy as np
 
+from ..geometry import project
 from ..overlay import FOUND, TIP
+from ..sim.plant import Plant
 from .pictures import STYLE, TRUTH
 from .servo_run import Run
 
 MISS = '#ffb347'
 
 
-def draw(run: Run, file: Path, robot: str) -> Path:
-    """Write the picture of a run; its path. Raises OSError where it can't be written."""
+def draw(run: Run, file: Path, moved: Plant) -> Path:
+    """Write the picture of a run of the robot that it `moved`; its path. Raises OSError where it can't be written."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(11, 4.6), layout='constrained')
+        figure = Figure(figsize=(12, 4), layout='constrained')
         FigureCanvasAgg(figure)
-        path, errors = figure.subplots(1, 2, width_ratios=(1, 1.6))
+        seen, path, errors = figure.subplots(1, 3, width_ratios=(1, 1.1, 1.7))
+        _seen(seen, run, moved)
         _path(path, run)
         _errors(errors, run)
-        figure.suptitle(f'{robot.replace("_", " ")}: the controller sees only the measured tip', fontsize=11)
         figure.savefig(file, dpi=100)
     return file
+
+
+def _seen(axes, run: Run, moved: Plant) -> None:
+    """Plane A when the first task was done, with all that the target and the tip have done until then."""
+    now = run.ends[0]
+    frame = moved.scene(run.record.joints[now], 0, now).frame
+    height, width = frame.images[0].shape
+    axes.imshow(frame.images[0], cmap='gray', aspect='equal')
+    for points, style in ((run.record.target, dict(color=MISS, lw=2)), (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=2))):
+        axes.plot(*project(frame.views[0].P, _between(points, 0, now)).T, **style)
+    axes.set(xlim=(0.15 * width, 0.85 * width), ylim=(0.95 * height, 0.05 * height), xticks=[], yticks=[], title='plane A')
 
 
 def _path(axes, run: Run) -> None:
@@ -36,9 +49,9 @@ def _path(axes, run: Run) -> None:
                           (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=4, label='measured tip'))):
         x, y = _between(points, start, stop)[:, :2].T * 1e3
         axes.plot(x, y, **style)
-    axes.set(aspect='equal', xlabel='x (mm)', ylabel='y (mm)')
+    axes.set(aspect='equal', xlabel='x (mm)', ylabel='y (mm)', title='the tip')
     axes.grid(True)
-    axes.legend(loc='center', fontsize=8)
+    axes.legend(loc='center', bbox_to_anchor=(0.62, 0.3), fontsize=8)
 
 
 def _errors(axes, run: Run) -> None:
@@ -56,9 +69,9 @@ def _errors(axes, run: Run) -> None:
     if record.blackout:
         axes.axvspan(*((t - start) * 1e-9 for t in record.blackout), color='#8899aa', alpha=0.35, label='plane B blank')
     axes.axhline(0.3, color=TIP, lw=0.8, label='0.3 mm')
-    axes.set(xlabel='time (s)', ylabel='distance from the target (mm)')
+    axes.set(xlabel='time (s)', ylabel='mm', title='its distance from the target')
     axes.grid(True)
-    axes.legend(fontsize=8, loc='upper right')
+    axes.legend(fontsize=8, loc='lower left', framealpha=0.9)
 
 
 def _between(points: dict[int, np.ndarray], start: int, stop: int) -> np.ndarray:
