@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluoro_shape_ros.curve import arc_length, curvature
-from fluoro_shape_ros.sim.kinematics import TendonRobot, Tube, TubeRobot, driven, jacobian, limited, loaded
+from fluoro_shape_ros.sim.kinematics import TendonRobot, Tube, TubeRobot, driven, jacobian, limited, loaded, reaching
 from fluoro_shape_ros.sim.shapes import Cannula, Pose
 
 QUARTER = np.pi / 2
@@ -78,11 +78,17 @@ def test_the_jacobian_foretells_small_steps(robot):
         np.testing.assert_allclose(jacobian(robot, q) @ d, moved, atol=0.02 * np.linalg.norm(moved) + 1e-9)
 
 
+@pytest.mark.parametrize('robot', [TWO, THREE, TENDON])
+def test_a_robot_is_placed_where_its_tip_shall_be(robot):
+    tip = robot.backbone(some(robot, 1))[-1]
+    np.testing.assert_allclose(robot.backbone(reaching(robot, tip, some(robot)))[-1], tip, atol=1e-4)
+
+
 def test_a_joint_keeps_its_speed_and_its_limits():
     q = np.array([0.02, 0.02, 0.0, 0.0])
     np.testing.assert_allclose(driven(TWO.joints, q, np.array([0.0205, 9.0, -9.0, 0.05]), 0.1), [0.0205, 0.022, -0.1, 0.05])
-    np.testing.assert_allclose(driven(TWO.joints, q, np.array([9.0, -9.0, 9.0, -9.0]), 1e3), [0.06, 0.004, 2 * np.pi, -2 * np.pi])
-    np.testing.assert_allclose(limited(TWO.joints, np.array([0.0, 1.0, 0.0, 0.0])), [0.004, 0.06, 0, 0])
+    np.testing.assert_allclose(driven(TWO.joints, q, np.array([9.0, -9.0, 9.0, -9.0]), 1e3), [0.1, 0.004, 2 * np.pi, -2 * np.pi])
+    np.testing.assert_allclose(limited(TWO.joints, np.array([0.0, 1.0, 0.0, 0.0])), [0.004, 0.1, 0, 0])
 
 
 def test_a_load_bends_a_straight_rod_as_a_cantilever():

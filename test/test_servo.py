@@ -29,9 +29,9 @@ def test_without_the_loop_every_target_is_missed(name):
     robot = plant.ROBOTS[name].robot
     for seed in range(3):
         moved = plant.plant(name, seed, 64, with_anatomy=False)
-        targets, joints = plant.goals(name, seed, 3)
+        targets, joints = plant.goals(name, seed, moved, 2)
         for target, q in zip(targets, joints):
-            assert_allclose(robot.backbone(q, plant.STEP)[-1], target)
+            assert_allclose(robot.backbone(q, plant.STEP)[-1], target, atol=0.3e-3)
             assert_allclose(limited(robot.joints, q), q)
             assert np.linalg.norm(moved.backbone(q)[-1] - target) > 3e-3
 

@@ -51,7 +51,7 @@ class TubeRobot:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        reach = tuple(Joint(f'reach_{k + 1}', 0.004, tube.curved, 0.02) for k, tube in enumerate(self.tubes))
+        reach = tuple(Joint(f'reach_{k + 1}', 0.004, 0.1, 0.02) for k in range(len(self.tubes)))
         return reach + tuple(Joint(f'rotation_{k + 1}', -2 * np.pi, 2 * np.pi, 1.0) for k in range(len(self.tubes)))
 
     def sections(self, q: np.ndarray) -> list[Section]:
@@ -119,6 +119,17 @@ def jacobian(robot: TubeRobot | TendonRobot, q: np.ndarray) -> np.ndarray:
     steps = np.array([1e-4 * (joint.high - joint.low) for joint in robot.joints])
     tips = [[robot.backbone(q + sign * d, COARSE)[-1] for sign in (1, -1)] for d in np.diag(steps)]
     return np.stack([(ahead - behind) / (2 * h) for h, (ahead, behind) in zip(steps, tips)], axis=1)
+
+
+def reaching(robot: TubeRobot | TendonRobot, tip: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(n,) joint values, found from q on, at which a robot's tip is as near as it gets to (3,) `tip`, m: damped least squares within the limits."""
+    speed = np.array([joint.speed for joint in robot.joints])
+    for _ in range(60):
+        error = tip - robot.backbone(q, COARSE)[-1]
+        J = jacobian(robot, q) * speed
+        step = speed * (J.T @ np.linalg.solve(J @ J.T + 0.001**2 * np.eye(3), error * min(1.0, 0.005 / max(np.linalg.norm(error), 1e-9))))
+        q = limited(robot.joints, q + step)
+    return q
 
 
 def limited(joints: Sequence[Joint], q: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import anatomy, carm, placement
-from .kinematics import TendonRobot, Tube, TubeRobot, loaded
+from .kinematics import TendonRobot, Tube, TubeRobot, loaded, reaching
 from .scenes import RADIUS, Run, Scene
 from .shapes import Pose
 from .xray import Exposure
@@ -18,6 +18,7 @@ SHAFT = 0.05                # m before the base: it comes in through the border 
 STEP = 5e-4                 # m, of a backbone that is drawn
 MODEL_ERROR = 0.12          # by which a robot bends otherwise than its model
 PUSHED = (0.008, 0.012)     # m, by which tissue pushes the tip aside at the start
+REACHED = 0.1e-3        # m
 UP = Pose(np.array([0.0, 0.0, -0.05]), np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))      # along z, across both beams
 
 
@@ -77,11 +78,15 @@ def predicted(name: str, q: np.ndarray) -> np.ndarray:
     return placement.with_shaft(ROBOTS[name].robot.backbone(q, 2e-3), SHAFT)
 
 
-def goals(name: str, seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """`count` targets of the tip (count, 3) m, and the joint values (count, n) at which the model has it there."""
-    known, rng = ROBOTS[name], np.random.default_rng([seed, 9])
-    joints = known.start + known.spread * rng.uniform(-1, 1, (count, len(known.start)))
-    return np.stack([known.robot.backbone(q, STEP)[-1] for q in joints]), joints
+def goals(name: str, seed: int, moved: Plant, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`count` targets (count, 3) in m that both the robot `moved` and its model can reach, and the joint values (count, n) at which the model does."""
+    known, rng, found = ROBOTS[name], np.random.default_rng([seed, 9]), []
+    while len(found) < count:
+        target = moved.backbone(known.start + known.spread * rng.uniform(-1, 1, len(known.start)))[-1]
+        q = reaching(known.robot, target, known.start)
+        if np.linalg.norm(known.robot.backbone(q, STEP)[-1] - target) < REACHED:
+            found.append((target, q))
+    return tuple(map(np.stack, zip(*found)))
 
 
 def without_device(plant: Plant, index: int, scene: Scene, plane: int) -> Scene:

@@ -74,7 +74,7 @@ def run(args, seed: int) -> Run:
     """Start robot, node and controller, drive the tip along a square and to targets, end them. Raises ToolError where one of them fails or stalls."""
     begun = time.monotonic()
     what = plant.plant(args.robot, seed, args.size, with_anatomy=False)
-    targets, joints = plant.goals(args.robot, seed, args.targets)
+    targets, joints = plant.goals(args.robot, seed, what, args.targets)
     open_loop = tuple(float(np.linalg.norm(what.backbone(q)[-1] - target)) for q, target in zip(joints, targets))
     with contextlib.ExitStack() as stack:
         children = {name: stack.enter_context(child(arguments, args.out / f'{name}.log')) for name, arguments in commands(args, seed).items()}
