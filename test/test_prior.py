@@ -9,10 +9,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from fluoro_shape_ros import prior
 from fluoro_shape_ros.config import Config, ConfigError
 from fluoro_shape_ros.data import Outcome, Prior
+from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
-from fluoro_shape_ros.tools.bench_prior import predictions, pushed
+from fluoro_shape_ros.tools import bench_prior
+from fluoro_shape_ros.tools.bench_prior import Try, predictions, pushed
+from fluoro_shape_ros.tools.trial import Answer
 
 SECOND = 10**9
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
@@ -89,6 +92,14 @@ def test_a_pushed_tip_is_as_far_as_it_says():
 def test_unusable_parameters_are_refused(values):
     with pytest.raises(ConfigError):
         Config.from_values(**values)
+
+
+def test_the_bench_counts_by_hand():
+    good = Answer(0, Outcome.OK, errors=Errors(0.1e-3, 0, 0, 0.2e-3, 0, 0))
+    without = [Try(good, 0.2, 0.0, ''), Try(Answer(1, Outcome.NO_DEVICE_A), 0.2, 0.0, '')]
+    done = [Try(good, 0.1, 0.01e-3, 'agrees'), Try(good, 0.05, float('nan'), 'ignored: it is stale')]
+    line = bench_prior._line('clutter', 'good', done, without).split()
+    assert line == 'clutter good 2 of 2 2 0 0.100 0.200 3.00 1 of 2 0.010 1 agrees, 1 ignored'.split()
 
 
 # ---- on images

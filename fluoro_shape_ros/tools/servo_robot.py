@@ -26,7 +26,7 @@ from ..sim.publisher import FluoroSim, true_shape, use_large_image_profile
 from ..sim.scenes import FRAME_ID, Scene
 from . import cli
 
-CONNECT_S = 60.0        # for everybody to find each other
+CONNECT_S = 120.0       # for everybody to find each other
 PATIENCE_S = 2.0        # for the answer to a pair, by the wall's clock
 BLACKOUT_S = 1.0        # of a blackout, by the robot's clock
 BLIND = 1               # the plane that a blackout takes the device from

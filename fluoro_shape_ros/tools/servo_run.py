@@ -21,7 +21,7 @@ from .servo_referee import Record, Referee
 SPEED = 0.006           # m/s, of a target that moves
 SETTLED, STEADY = 0.12e-3, 6    # m; pairs: the tip has arrived when so many in a row were measured as near as that
 TARGET_S = 10.0         # by the robot's clock, for a target
-STALL_S = 60.0          # by the wall's clock, without a pair
+STALL_S = 120.0         # by the wall's clock, without a pair
 
 
 @dataclass(frozen=True)
