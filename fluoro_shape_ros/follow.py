@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from .config import Config
 from .curve import resample
 from .detect import Detection, track
+from .fit import Fit
 from .geometry import distort, fundamental, pixels_per_metre, project, undistort
 from .matching import align
 from .plausibility import check_fit
@@ -44,10 +45,15 @@ def found_near(guess: Guess, images, fields, views, config: Config) -> Detection
     if found is None:
         return None
     f = found.fit
-    points = f.spline(np.linspace(f.start, f.stop, 100))
+    points = curve(f)
     sharp = (f.open_end | (f.end_sigma < SHARP)).all()
     believed = sharp and whole(f.stop - f.start, guess, views) and borne_out(points, guess) and not check_fit(f, config)
     return found if believed else None
+
+
+def curve(f: Fit) -> np.ndarray:
+    """(100, 3) m along the fitted device."""
+    return f.spline(np.linspace(f.start, f.stop, 100))
 
 
 def reach_px(guess: Guess, view) -> float:

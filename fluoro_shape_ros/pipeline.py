@@ -15,7 +15,7 @@ from .detect import detect, track
 from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
-from .follow import found_near, reach_px
+from .follow import curve, found_near, reach_px
 from .geometry import GeometryError, check_pair, distort, pixels_per_metre, project, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
@@ -48,9 +48,9 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
         around = [region_around(v, prior.previous.points) for v in frame.views]
         found = track([stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, radius, prior.previous.points)
         clock.lap('track')
-    if found is None and guess is not None:
+    if guess is not None and (found is None or not borne_out(curve(found.fit), guess)):
         around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
-        found = found_near(guess, [stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, config)
+        found = found_near(guess, [stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, config) or found
         clock.lap('follow')
     if found is None:
         found = detect([stable_noise(i, polarity) for i in images], fields, frame.views, radius, config.detection.min_length_px)
@@ -61,7 +61,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
 
     f = found.fit
     ends = f.spline(np.array([f.start, f.stop]))
-    known = _known_order(f.spline(np.linspace(f.start, f.stop, 100)), prior, guess)
+    known = _known_order(curve(f), prior, guess)
     forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, known)
     shape = backbone(f, forward, config.curve.backbone_spacing)
     clock.lap('backbone')

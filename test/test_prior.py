@@ -1,5 +1,6 @@
 """A prediction: which one counts, what it can be, and that it helps when right and does no harm when wrong."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -133,6 +134,22 @@ def test_a_pushed_robot_is_measured_where_it_is_without_a_search(scene, config, 
     assert result.prediction == 'agrees' and not result.warnings
     assert 'follow' in result.stage_seconds and 'detect' not in result.stage_seconds
     assert np.linalg.norm(result.shape.tip - scene.truth[-1]) < 0.2e-3 < 0.01 < np.linalg.norm(good[-1] - scene.truth[-1])
+
+
+def test_tracking_that_the_prediction_contradicts_gives_way_to_it(scene, config, answer, good, monkeypatch):
+    """Say tracking held on to the first half of the device only."""
+    import fluoro_shape_ros.pipeline as pipeline
+    real = pipeline.track
+
+    def half(*arguments):
+        found = real(*arguments)
+        return replace(found, fit=replace(found.fit, stop=(found.fit.start + found.fit.stop) / 2))
+    monkeypatch.setattr(pipeline, 'track', half)
+    lost = reconstruct(scene.frame, config, Prior(previous=answer.shape))
+    assert lost.shape is None or lost.shape.length < 0.7 * answer.shape.length
+    result = reconstruct(scene.frame, config, Prior(previous=answer.shape, predicted=good))
+    assert result.prediction == 'agrees'
+    assert_allclose(result.shape.tip, answer.shape.tip, atol=0.2e-3)
 
 
 def test_it_orders_the_ends(scene):

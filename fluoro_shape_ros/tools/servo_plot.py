@@ -49,6 +49,9 @@ def _path(axes, run: Run) -> None:
                           (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=4, label='measured tip'))):
         x, y = _between(points, start, stop)[:, :2].T * 1e3
         axes.plot(x, y, **style)
+    # a single wrong measurement shows in the errors, and need not shrink the path
+    x, y = _between(run.record.true, start, stop)[:, :2].T * 1e3
+    axes.set(xlim=(x.min() - 1.5, x.max() + 1.5), ylim=(y.min() - 1.5, y.max() + 1.5))
     axes.set(aspect='equal', xlabel='x (mm)', ylabel='y (mm)', title='the tip')
     axes.grid(True)
     axes.legend(loc='center', bbox_to_anchor=(0.62, 0.3), fontsize=8)
