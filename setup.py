@@ -13,6 +13,7 @@ EXECUTABLES = {
     'fluoro_shape_replay': 'fluoro_shape_ros.tools.replay',
     'fluoro_shape_bench': 'fluoro_shape_ros.tools.bench',
     'fluoro_shape_demo': 'fluoro_shape_ros.tools.demo',
+    'fluoro_shape_servo_demo': 'fluoro_shape_ros.tools.servo_demo',
 }
 
 # real ROS 2 Jazzy as wheels; where ROS is installed (or there are no wheels) the extra is empty
@@ -31,6 +32,8 @@ EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement
 EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags']]
 EXTRAS['test'] = [*EXTRAS['all'], *EXTRAS['fuzz'], 'pytest>=7.4', 'hypothesis>=6.98']
 
+SHARED = sorted(path for kind in ('xml', 'yaml', 'rviz', 'json', 'html', 'py') for path in glob(f'resource/*.{kind}'))
+
 setup(
     name=NAME,
     version='0.1.0',
@@ -46,7 +49,7 @@ setup(
     packages=find_packages(include=[f'{NAME}*', 'msg_adapters*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
-        (f'share/{NAME}', ['package.xml', *sorted(glob('resource/*.xml') + glob('resource/*.yaml') + glob('resource/*.rviz') + glob('resource/*.json') + glob('resource/*.html'))]),
+        (f'share/{NAME}', ['package.xml', *SHARED]),
         # `ros2 run` looks in lib/<package>; pip puts the entry points below in bin/ only
         (f'lib/{NAME}', [f'resource/bin/{name}' for name in EXECUTABLES]),
     ],

@@ -51,6 +51,9 @@ class CurveConfig:
     backbone_spacing: float = _p(0.001, 'Arc-length step of the published backbone', unit='m', low=1e-5, high=0.1)
     base_position: tuple[float, ...] = _p((), 'Where the device enters, x y z in the reference frame; empty: unknown', unit='m', element=float)
     tracking: bool = _p(True, 'Start from the previous result')
+    prior_max_age: float = _p(0.5, 'A predicted_backbone older than the pair by more than this is not used', unit='s', low=0.0, high=60.0)
+    prior_sigma: float = _p(0.010, 'Standard deviation of a predicted_backbone at its tip: how far tissue may push the robot from where the model has it',
+                            unit='m', low=1e-4, high=0.1)
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,7 @@ class Prior:
     previous_stamp_ns: int | None = None
     masks: tuple[np.ndarray, np.ndarray] | None = None  # (H, W) float32, device-free mean image of each plane
     predicted: np.ndarray | None = None     # (N, 3) a kinematic model's guess, base to tip, m
+    prediction_fault: str = ''              # why the newest guess can't be used; empty where it can, or where there is none
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class Reconstruction:
     warnings: tuple[str, ...] = ()                      # e.g. tip_ambiguous
     centerlines: tuple[Centerline | None, Centerline | None] = (None, None)
     stage_seconds: dict[str, float] = field(default_factory=dict)   # wall time of each stage
+    prediction: str = ''                                # agrees, not compared, or ignored and why; empty: there was none
 
     def __post_init__(self):
         if (self.outcome is Outcome.OK) != (self.shape is not None):

@@ -15,9 +15,11 @@ from .detect import detect, track
 from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
+from .follow import curve, found_near, reach_px
 from .geometry import GeometryError, check_pair, check_scale, distort, pixels_per_metre, project, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
+from .prior import Guess, borne_out, judged, look
 
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
@@ -35,17 +37,22 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
     fields = tuple(field_of_view(image) for image in frame.images)
     clock.lap('prepare')
     by = _by_paper if config.curve.method == 'paper' else _by_spline
-    return by(frame, images, fields, config, prior, clock)
+    guess, why = look(prior, frame.views, config.curve.prior_sigma)
+    return judged(by(frame, images, fields, config, prior, guess, clock), guess, why)
 
 
-def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, clock: _Stopwatch) -> Reconstruction:
-    """method:=spline: both images are fitted at once, from where the device was or from a search of the whole images."""
+def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
+    """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images."""
     radius, polarity = config.detection.robot_radius, config.detection.polarity
     found = None
     if config.curve.tracking and prior.previous is not None:
         around = [region_around(v, prior.previous.points) for v in frame.views]
         found = track([stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, radius, prior.previous.points)
         clock.lap('track')
+    if guess is not None and (found is None or not borne_out(curve(found.fit), guess)):
+        around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
+        found = found_near(guess, [stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, config) or found
+        clock.lap('follow')
     if found is None:
         found = detect([stable_noise(i, polarity) for i in images], fields, frame.views, radius, config.detection.min_length_px)
         clock.lap('detect')
@@ -55,7 +62,8 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, clock
 
     f = found.fit
     ends = f.spline(np.array([f.start, f.stop]))
-    forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, prior)
+    known = _known_order(curve(f), prior, guess)
+    forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, known)
     shape = backbone(f, forward, config.curve.backbone_spacing)
     clock.lap('backbone')
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
@@ -67,7 +75,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, clock
     return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps)
 
 
-def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, clock: _Stopwatch) -> Reconstruction:
+def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
     """method:=paper: segment each image, correspond, triangulate, and believe eq. 3."""
     images = [dark_device(image, config.detection.polarity) for image in images]
     widths = paper.half_width_px(frame.views, config)
@@ -85,7 +93,8 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, clock:
 
     best = max(curves, key=lambda c: arc_length(c)[-1])
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, best) for v in frame.views])
-    forward, guessed = _tip_rule(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, prior)
+    forward, guessed = _tip_rule(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config,
+                                 _known_order(best, prior, guess))
     points, s = resample(best if forward else best[::-1], config.curve.backbone_spacing)
     residuals = residuals_px(points, frame.views, seen)
     clock.lap('curve')
@@ -148,11 +157,11 @@ def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] =
     return out
 
 
-def region_around(view, points: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of the image within REGION_PX of the projections of (N, 3) points."""
+def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:
+    """Rows and columns of the image within `margin_px` of the projections of (N, 3) points."""
     uv = distort(view, project(view.P, points))
-    low = np.clip(np.floor(uv.min(axis=0)) - REGION_PX, 0, [view.width - 1, view.height - 1]).astype(int)
-    high = np.clip(np.ceil(uv.max(axis=0)) + REGION_PX, 1, [view.width, view.height]).astype(int)
+    low = np.clip(np.floor(uv.min(axis=0)) - margin_px, 0, [view.width - 1, view.height - 1]).astype(int)
+    high = np.clip(np.ceil(uv.max(axis=0)) + margin_px, 1, [view.width, view.height]).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
@@ -177,12 +186,18 @@ def _at_border(ends: np.ndarray, views, seen) -> tuple[bool, bool]:
     return bool(at_border[0]), bool(at_border[1])
 
 
-def _tip_rule(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, prior: Prior) -> tuple[bool, bool]:
+def _known_order(points: np.ndarray, prior: Prior, guess: Guess | None) -> np.ndarray | None:
+    """(N, 3) a curve known to run from base to tip, m: the previous result, else the prediction if the (N, 3) points found bear it out."""
+    if prior.previous is not None:
+        return prior.previous.points
+    return guess.points if guess is not None and borne_out(points, guess) else None
+
+
+def _tip_rule(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, known: np.ndarray | None) -> tuple[bool, bool]:
     """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
     def border_px() -> np.ndarray:
         return np.stack([border_distance(f, distort(v, project(v.P, ends))) for f, v in zip(fields, views)], axis=1)
-    previous = prior.previous.points if prior.previous is not None else None
-    return tip_is_last(ends, at_border, border_px, config.curve.base_position, previous)
+    return tip_is_last(ends, at_border, border_px, config.curve.base_position, known)
 
 
 class _Stopwatch:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import deque
 from functools import lru_cache, partial
 
 import cv2
@@ -29,12 +30,14 @@ from .limits import bounded
 from .outputs import Outputs
 from .pairing import PLANES, Pairer
 from .pipeline import reconstruct
+from .prior import newest
 from .subscriptions import AdaptiveSubscription, path_of, surviving, unheard
 from .transforms import TfMissing, TfPoses, import_tf
 from .waiting import CameraBook, Pair, WaitingRoom
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
+PREDICTIONS = 256       # that are kept: a model may tell them faster than images come
 OVERDUE_S = 5.0         # a pair takes a fraction of a second; one that takes longer is told
 
 
@@ -47,8 +50,9 @@ class FluoroShapeNode(Node):
     def __init__(self):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
-        self._enabled, self._prediction, self._levels, self._room = True, None, None, WaitingRoom()
+        self._enabled, self._levels, self._room = True, None, WaitingRoom()
         self._overdue, self._senders = False, dict.fromkeys(PLANES, 0)
+        self._predictions = deque(maxlen=PREDICTIONS)
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
@@ -142,10 +146,9 @@ class FluoroShapeNode(Node):
     def _on_prediction(self, data: bytes) -> None:
         try:
             msg = path_of(data)
-            self._prediction = Prediction(path_to_points(msg), msg.header.frame_id)
+            self._predictions.append(Prediction(path_to_points(msg), msg.header.frame_id, stamp_ns(msg)))
             self._tally.accepted('prediction')
         except BadPath as error:
-            self._prediction = None
             self._tally.refused('prediction', str(error))
         self._report_changes()
 
@@ -154,7 +157,8 @@ class FluoroShapeNode(Node):
         pair, lost = self._room.take(tuple(self._books.values()), time.monotonic())
         if pair is not None:
             cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
-            lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, self._prediction))
+            prediction = newest(self._predictions, pair.stamps[0])
+            lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, prediction))
         self._drop(lost)
 
     def _drop(self, pairs: int) -> None:
@@ -164,6 +168,7 @@ class FluoroShapeNode(Node):
     def _forget(self) -> None:
         """Nothing of what came before counts any more, but the cameras and the mask."""
         self._room.clear()
+        self._predictions.clear()
         self._worker.clear()
         self._memory.reset()
 
@@ -231,7 +236,7 @@ class FluoroShapeNode(Node):
         window = image_window(job, frame)
         if self._memory.take_for_mask(frame, window):
             return None
-        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window, self._tally))
+        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window))
         if not self._memory.remember(job, frame, result):
             return None
         self._outputs.answer(frame, result)
@@ -256,12 +261,10 @@ class FluoroShapeNode(Node):
         gap = self._pairer.gap_ns
         planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, unheard=partial(unheard, self._inputs, plane),
                                     reliability='best_effort' if self._inputs[f'image {plane}'].best_effort else 'reliable',
-                                    fell_back=self._inputs[f'image {plane}'].fell_back,
-                                    publishers=self._senders[plane]) for plane in PLANES]
+                                    fell_back=self._inputs[f'image {plane}'].fell_back, publishers=self._senders[plane]) for plane in PLANES]
         pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)
         fault = self._tally.reason('prediction')
-        clock = self.get_clock()
-        still = 'use_sim_time is set, but there is no /clock' if clock.ros_time_is_active and not clock.now().nanoseconds else ''
+        still = 'use_sim_time is set, but there is no /clock' if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else ''
         notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still)))
         results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes,
                                              overdue_s=self._overdue_s())

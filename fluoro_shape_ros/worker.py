@@ -18,6 +18,7 @@ from .config import Config
 from .data import Frame, Outcome, Prior, Reconstruction, Shape, View
 from .limits import Oversized
 from .pairing import PLANES
+from .prior import staleness
 
 
 class NoTransform(LookupError):
@@ -60,6 +61,7 @@ class Prediction:
 
     points: np.ndarray      # (N, 3) m, base to tip
     frame_id: str
+    stamp_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ class Memory:
         self._masks = tuple((total / self._taken).astype(np.float32) for total in self._sums)
         self._sums, self._wanted = None, 0
 
-    def prior(self, job: Job, frame: Frame, window: tuple, tally: Tally) -> Prior:
+    def prior(self, job: Job, frame: Frame, window: tuple) -> Prior:
         """What is known before `frame` is looked at. A mask that no longer fits the images is dropped."""
         with self._lock:
             if self._masks is not None and window != self._window:
@@ -197,7 +199,8 @@ class Memory:
             previous, stamp_ns, frame_id = self._previous or (None, None, None)
             if not job.config.curve.tracking or frame_id != frame.frame_id:
                 previous, stamp_ns = None, None
-            return Prior(previous, stamp_ns, self._masks, _predicted(job, frame, tally))
+            points, fault = _predicted(job, frame)
+            return Prior(previous, stamp_ns, self._masks, points, fault)
 
     def remember(self, job: Job, frame: Frame, result: Reconstruction) -> bool:
         """Keep the shape of a result for the next pair; False where the result is out of date and must not be published."""
@@ -214,14 +217,15 @@ def image_window(job: Job, frame: Frame) -> tuple:
     return tuple((image.shape, image.dtype, c.window) for image, c in zip(frame.images, job.cameras))
 
 
-def _predicted(job: Job, frame: Frame, tally: Tally) -> np.ndarray | None:
-    guess = job.prediction
-    if guess is None:
-        return None
-    if guess.frame_id not in ('', frame.frame_id):
-        tally.refused('prediction', f'it is in frame "{guess.frame_id}", not in "{frame.frame_id}"')
-        return None
-    return guess.points
+def _predicted(job: Job, frame: Frame) -> tuple[np.ndarray | None, str]:
+    """(N, 3) m, the prediction for a pair, or None and why it does not count."""
+    given = job.prediction
+    if given is None:
+        return None, ''
+    fault = staleness(given.stamp_ns, frame.stamp_ns, job.config.curve.prior_max_age)
+    if given.frame_id not in ('', frame.frame_id):
+        fault = f'it is in frame "{given.frame_id}", not in "{frame.frame_id}"'
+    return (None if fault else given.points), fault
 
 
 class Worker:

@@ -72,6 +72,7 @@ class ReconstructionSummary:
     outcome: Outcome | None = None  # of the last pair; None: there was none yet
     detail: str = ''
     warnings: tuple[str, ...] = ()  # of the last pair
+    prediction: str = ''            # what became of it for the last pair
     notes: tuple[str, ...] = ()     # what else went wrong lately
     silent_s: float | None = None   # since the last pair
     overdue_s: float = 0.0          # for how long the pair at work has been, where that is too long
@@ -146,12 +147,13 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
     elif s.silent_s > WINDOW_S:
         level, message = STALE, '; '.join((f'no pair for {s.silent_s:.0f} s; the last one: {reason}', *s.notes))
     elif s.outcome is not Outcome.OK:
-        level, message = ERROR if s.outcome in FAULTS else WARN, '; '.join((reason, *s.notes))
+        level, message = ERROR if s.outcome in FAULTS else WARN, '; '.join((reason, *notes))
     elif notes:
         level, message = WARN, '; '.join(notes)
     else:
         level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images' if ms else '')
-    values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'overdue pairs': s.overdue,
+    values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction,
+              'overdue pairs': s.overdue,
               'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
     return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
 
@@ -239,7 +241,7 @@ class Tally:
         with self._lock:
             latency = tuple(value for _, value in self._recent(good, self._clock()))
             outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
-        seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings)
+        seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, prediction=done.prediction)
         return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes,
                                      overdue=self.count('overdue'), **seen, **known)
 

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 import ros_client as ros                            # noqa: E402
-from geometry_msgs.msg import PoseStamped           # noqa: E402
+from geometry_msgs.msg import Point, Pose, PoseStamped     # noqa: E402
 from nav_msgs.msg import Path                       # noqa: E402
 from rcl_interfaces.srv import GetParameters        # noqa: E402
 from rclpy.parameter import Parameter               # noqa: E402
@@ -216,11 +216,18 @@ def test_mask_capture(client):
     assert client.trigger('clear_mask').success
 
 
-def test_a_bad_prediction_is_named(client):
+def test_a_prediction_is_used_and_a_bad_or_stale_one_named(client):
     client.prediction.publish(Path(poses=[PoseStamped()]))
     assert client.hears('predicted_backbone', '1 poses')
-    client.prediction.publish(Path(poses=[PoseStamped(), PoseStamped()]))
-    assert client.answer(client.send_pixels(GOOD))
+    good = Path(poses=[PoseStamped(pose=Pose(position=Point(x=x, y=y, z=z))) for x, y, z in ros.curve()[::20].tolist()])
+    good.header.stamp = ros.time_msg(client.now_ns + ros.STEP_NS)
+    client.prediction.publish(good)
+    fate = lambda: client.value('reconstruction', 'prediction')     # noqa: E731
+    assert client.until(lambda: client.answer(client.send_pixels(GOOD)) and fate() == 'agrees')
+    client.now_ns += 10**9
+    assert client.answer(client.send_pixels(GOOD)) and client.hears('prediction_ignored', 'older than the pair')
+    assert client.trigger('reset').success      # forgets it
+    assert client.good() and fate() == ''
 
 
 def test_16_bits_in_either_byte_order(client):

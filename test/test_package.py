@@ -162,7 +162,7 @@ def test_imports_without_ros(module):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize('name', ['fluoro_shape_node', 'fluoro_shape_sim', 'fluoro_shape_demo'])
+@pytest.mark.parametrize('name', ['fluoro_shape_node', 'fluoro_shape_sim', 'fluoro_shape_demo', 'fluoro_shape_servo_demo'])
 def test_what_needs_ros_says_so_in_one_line(name):
     done = python(f'{WITHOUT_ROS}\nimport importlib, sys\nsys.exit(importlib.import_module(sys.argv[1]).main([]))', EXECUTABLES[name])
     assert done.returncode == 1

@@ -105,7 +105,7 @@ GOOD = Reconstruction(Outcome.OK, shape=SHAPE)
 def recall(memory, **options):
     the_job = job(**options)
     frame = adapt(the_job, view_of, no_lookup, Tally())
-    return memory.prior(the_job, frame, image_window(the_job, frame), Tally())
+    return memory.prior(the_job, frame, image_window(the_job, frame))
 
 
 def after_good(memory):
@@ -167,11 +167,17 @@ def test_a_mask_that_no_longer_fits_is_cleared_and_said_so(changed):
     assert recall(memory).masks is None
 
 
-def test_a_prediction_goes_along_unless_it_is_in_another_frame():
+@pytest.mark.parametrize('frame_id, stamp_ns, fault', [
+    ('plane_a_optical', 5, ''),
+    ('', 5, ''),
+    ('elsewhere', 5, 'it is in frame "elsewhere", not in "plane_a_optical"'),
+    ('', 0, 'it has no stamp'),
+])
+def test_a_prediction_goes_along_unless_it_is_in_another_frame_or_has_no_stamp(frame_id, stamp_ns, fault):
     points = np.ones((2, 3))
-    assert recall(Memory(), prediction=Prediction(points, 'plane_a_optical')).predicted is points
-    assert recall(Memory(), prediction=Prediction(points, '')).predicted is points
-    assert recall(Memory(), prediction=Prediction(points, 'elsewhere')).predicted is None
+    prior = recall(Memory(), prediction=Prediction(points, frame_id, stamp_ns))
+    assert prior.prediction_fault == fault
+    assert prior.predicted is (None if fault else points)
 
 
 class Gate:

@@ -59,7 +59,10 @@ class Run:
 
     def scene(self, t: float = 0.0, index: int = 0, stamp_ns: int = 0) -> Scene:
         """The pair at `t` s of the motion (0: as drawn); `index` picks the noise."""
-        whole = self.backbone(t)
+        return self.scene_of(self.backbone(t), index, stamp_ns)
+
+    def scene_of(self, whole: np.ndarray, index: int = 0, stamp_ns: int = 0) -> Scene:
+        """The pair that shows the (N, 3) backbone `whole`."""
         truth = placement.seen_in_both(whole, self.fields)
         return Scene(self._frame(whole, index, stamp_ns), truth, self.radius, truth[0], self.name, self.seed)
 

@@ -7,6 +7,7 @@ arc-length steps, the last point exactly the tip. In the shape's own frame the b
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,6 +29,15 @@ class Pose:
     def apply(self, points: np.ndarray) -> np.ndarray:
         """(N, 3) points of the shape's own frame in the reference frame."""
         return points @ self.heading.T + self.base
+
+
+@dataclass(frozen=True)
+class Section:
+    """A piece of constant curvature; it bends in the plane at `rotation` about the tangent of the whole curve's base."""
+
+    length: float       # m
+    curvature: float    # 1/m, 0: straight
+    rotation: float     # rad
 
 
 @dataclass(frozen=True)
@@ -72,13 +82,23 @@ class Cannula:
 
     def backbone(self, step: float = STEP) -> np.ndarray:
         """(N, 3) m, from the closed form of circular arcs."""
-        s = _steps(self.length, step)
-        outer = _arc(np.minimum(s, self.outer_length), self.outer_curvature, self.outer_rotation)
-        # the frame slides along the arc without rolling (Bishop), so it bends about the axis across the bending plane
-        axis = np.array([0.0, -np.sin(self.outer_rotation), np.cos(self.outer_rotation)])
-        joint = Rotation.from_rotvec(axis * self.outer_curvature * self.outer_length).as_matrix()
-        inner = _arc(np.maximum(s - self.outer_length, 0.0), self.inner_curvature, self.inner_rotation)
-        return self.pose.apply(outer + inner @ joint.T)
+        return self.pose.apply(chain([Section(self.outer_length, self.outer_curvature, self.outer_rotation),
+                                      Section(self.inner_length, self.inner_curvature, self.inner_rotation)], step))
+
+
+def chain(sections: Sequence[Section], step: float = STEP) -> np.ndarray:
+    """(N, 3) m: sections one after another from the origin along +x, in equal arc-length steps of nearly `step` m.
+
+    The frame slides along each arc without rolling (Bishop), so that it bends about the axis across the bending plane.
+    """
+    s = _steps(sum(section.length for section in sections), step)
+    points, frame, start = np.zeros((len(s), 3)), np.eye(3), 0.0
+    for piece in sections:
+        points += _arc(np.clip(s - start, 0.0, piece.length), piece.curvature, piece.rotation) @ frame.T
+        axis = np.array([0.0, -np.sin(piece.rotation), np.cos(piece.rotation)])
+        frame = frame @ Rotation.from_rotvec(axis * piece.curvature * piece.length).as_matrix()
+        start += piece.length
+    return points
 
 
 def random_spline(rng: np.random.Generator, length: float, max_curvature: float = MAX_CURVATURE, max_turn: float = np.deg2rad(75)) -> Spline:

@@ -12,7 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..config import fields
-from . import latency, memory, speed
+from . import bench_prior, latency, memory, speed
 from .bench_table import plain, rows, table
 from .cli import ToolError, need, run
 from .composites import load
@@ -35,6 +35,7 @@ def main(argv=None) -> int:
     _add_speed(commands)
     _add_latency(commands)
     _add_memory(commands)
+    _add_prior(commands)
     return run(lambda args: args.body(args, parser), parser, argv)
 
 
@@ -49,6 +50,22 @@ def _add_speed(commands) -> None:
     command.add_argument('--alone', action='store_true', help='without method paper and skimage\'s frangi, which take seconds a pair')
     command.add_argument('--json', type=Path, metavar='FILE', help='write every time there, in s')
     command.set_defaults(body=_speed)
+
+
+def _add_prior(commands) -> None:
+    prior = commands.add_parser('prior', help='what a predicted_backbone is worth on the first pair, good or wrong')
+    prior.add_argument('--families', nargs='+', metavar='NAME', choices=[*ACCURACY, *ROBUSTNESS], default=list(bench_prior.FAMILIES),
+                       help=f'see accuracy and robustness (default: {" ".join(bench_prior.FAMILIES)})')
+    prior.add_argument('--scenes', type=_count, default=10, metavar='N', help='scenes of each family (default: 10)')
+    prior.add_argument('--rounds', type=_count, default=3, metavar='N', help='how often each is timed (default: 3)')
+    prior.add_argument('--first-seed', type=_seed, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    prior.set_defaults(body=_prior)
+
+
+def _prior(args, parser: argparse.ArgumentParser) -> int:
+    """Print the table of predictions."""
+    print(bench_prior.report(args.families, args.scenes, args.first_seed, args.rounds))
+    return 0
 
 
 def _speed(args, parser: argparse.ArgumentParser) -> int:

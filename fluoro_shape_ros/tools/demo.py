@@ -73,7 +73,7 @@ def _run(args) -> int:
             deadline = time.monotonic() + seconds
             while time.monotonic() < deadline and not until():
                 watcher.spin(0.05)
-                _check(children, args.out)
+                check_alive(children, args.out)
 
         print('fluoro_shape_demo: rendering and connecting ...', flush=True)
         spin(lambda: told.is_set() or watcher.score.start_ns is not None, STARTUP_S)
@@ -133,7 +133,7 @@ def _told_to_stop() -> threading.Event:
     return told
 
 
-def _check(children: dict[str, subprocess.Popen], out: Path) -> None:
+def check_alive(children: dict[str, subprocess.Popen], out: Path) -> None:
     """Raises ToolError, with the child's own words, where one has ended."""
     for name, process in children.items():
         if process.poll() is not None:

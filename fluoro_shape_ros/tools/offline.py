@@ -244,12 +244,11 @@ def take_mask(jobs: Iterable[Job], memory: Memory, views) -> int:
 
 def answer(job: Job, memory: Memory, views) -> tuple[Frame | None, Reconstruction]:
     """The frame of a pair of images, None where they can't be one, and the answer."""
-    tally = Tally()
-    frame = adapt(job, views, None, tally)
+    frame = adapt(job, views, None, Tally())
     if isinstance(frame, Reconstruction):
         return None, frame
     try:
-        result = reconstruct(frame, job.config, memory.prior(job, frame, image_window(job, frame), tally))
+        result = reconstruct(frame, job.config, memory.prior(job, frame, image_window(job, frame)))
     except Exception as error:  # the last line of defence: a pair must not take the other thousands with it; the tool ends with 1
         return frame, Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
     memory.remember(job, frame, result)

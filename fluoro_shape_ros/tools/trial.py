@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 
 from ..config import Config
-from ..data import Outcome, Prior
+from ..data import Outcome, Prior, Reconstruction
 from ..metrics import Errors, compare, surprise
 from ..pipeline import reconstruct
 from .bound import Bound, bound
@@ -88,7 +88,12 @@ def answer(case: Case, config: Config, device: bool = True) -> Answer:
     """What the pipeline says of one scene. The device's radius and its base's position are given, as a robot's user would."""
     scene = case.scene
     config = config.replace(robot_radius=scene.radius, base_position=scene.base_position.tolist())
-    result = reconstruct(scene.frame, config, Prior(masks=case.masks))
+    return answer_of(case, reconstruct(scene.frame, config, Prior(masks=case.masks)), device)
+
+
+def answer_of(case: Case, result: Reconstruction, device: bool = True) -> Answer:
+    """How far off a result for a scene is."""
+    scene = case.scene
     if result.shape is None or not device:
         return Answer(scene.seed, result.outcome, device, note=case.note, detail=result.detail)
     shape = result.shape
