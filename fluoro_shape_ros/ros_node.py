@@ -30,7 +30,7 @@ from .outputs import Outputs
 from .pairing import PLANES, Pairer
 from .pipeline import reconstruct
 from .subscriptions import AdaptiveSubscription, path_of, surviving, transform_lookup
-from .waiting import LOSSY_PATIENCE_S, PATIENCE_S, CameraBook, Pair, WaitingRoom
+from .waiting import CameraBook, Pair, WaitingRoom
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
 IMAGE_DEPTH, INFO_DEPTH = 5, 10
@@ -149,7 +149,7 @@ class FluoroShapeNode(Node):
     def _hand_over(self) -> None:
         """Give the newest pair whose cameras are known to the worker."""
         lossy = any(self._inputs[f'camera info {plane}'].best_effort for plane in PLANES)
-        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic(), LOSSY_PATIENCE_S if lossy else PATIENCE_S)
+        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic(), lossy)
         if pair is not None:
             cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
             lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, self._prediction))
