@@ -154,7 +154,8 @@ class FluoroShapeNode(Node):
 
     def _hand_over(self) -> None:
         """Give the newest pair whose cameras are known to the worker."""
-        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic())
+        lossy = any(self._inputs[f'camera info {plane}'].best_effort for plane in PLANES)
+        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic(), lossy)
         if pair is not None:
             cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
             prediction = newest(self._predictions, pair.stamps[0])

@@ -10,7 +10,8 @@ from .pairing import JUMP_NS
 
 BUFFER = 8              # changes of a plane's camera that are known, pairs that wait for their cameras
 RECENT = 64             # stamps of cameras that are known
-PATIENCE_S = 2.0        # for a camera info that should come with its image
+PATIENCE_S = 4.0        # for a camera info that should come with its image: what the middleware lost, it sends again within 3 s
+LOSSY_PATIENCE_S = 0.2  # the same where it sends nothing again
 
 
 class CameraBook:
@@ -119,11 +120,14 @@ class WaitingRoom:
         self._pairs.clear()
         self._since = None
 
-    def take(self, books: tuple[CameraBook, CameraBook], now: float) -> tuple[Pair | None, int]:
-        """The newest pair whose cameras are known, else, after PATIENCE_S, the newest one; and the number of older ones given up for it."""
+    def take(self, books: tuple[CameraBook, CameraBook], now: float, lossy: bool = False) -> tuple[Pair | None, int]:
+        """The newest pair whose cameras are known, and the number of older ones given up for it.
+
+        After PATIENCE_S (LOSSY_PATIENCE_S where a lost camera info is `lossy`: lost for good) the newest pair goes without.
+        """
         awaited = [[book.awaits(stamp) for book, stamp in zip(books, pair.stamps)] for pair in self._pairs]
         ready = [k for k, planes in enumerate(awaited) if not any(planes)]
-        if not ready and self._pairs and now >= self._since + PATIENCE_S:
+        if not ready and self._pairs and now >= self._since + (LOSSY_PATIENCE_S if lossy else PATIENCE_S):
             for book, late in zip(books, awaited[-1]):
                 if late:
                     book.give_up()

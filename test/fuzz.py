@@ -159,7 +159,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as corpus:
         for k, data in enumerate(seeds(args.target)):
             (Path(corpus) / str(k)).write_bytes(data)
-        atheris.Setup([sys.argv[0], corpus, f'-runs={args.runs}', f'-seed={args.seed}', '-max_len=65536', '-rss_limit_mb=1024', '-timeout=20', '-verbosity=1'],
+        atheris.Setup([sys.argv[0], corpus, f'-runs={args.runs}', f'-seed={args.seed}', '-max_len=65536', '-rss_limit_mb=1024', '-timeout=60', '-verbosity=1'],
                       target)
         atheris.Fuzz()      # does not return
 

@@ -27,7 +27,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
 STEP_NS = 66_000_000
-DOMAIN = 1 + 2 * (os.getpid() % 50)     # two runs on one machine do not meet
+DOMAIN = int(os.environ.get('TEST_DOMAIN', 1 + 2 * (os.getpid() % 50)))    # two runs on one machine rarely meet; TEST_DOMAIN: never
 OTHER = DOMAIN + 1                  # for a second node beside the first
 BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])     # so that the tip is no guess
 RADIUS = f'robot_radius:={drawing.RADIUS}'

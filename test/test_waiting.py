@@ -139,3 +139,10 @@ def test_a_room_is_bounded_and_forgets():
     assert waiting.add(Pair((T0,) * 2, (0, 0), 9.0)) == 1 and len(waiting) == BUFFER
     waiting.clear()
     assert len(waiting) == 0 and taken(waiting, (CameraBook(), CameraBook()), 99.0) == (None, 0)
+
+
+def test_what_is_lost_for_good_is_waited_for_but_shortly():
+    waiting, books = room((0, 0.0)), (CameraBook(), CameraBook())
+    assert waiting.take(books, 0.1, lossy=True) == (None, 0)
+    assert waiting.take(books, 0.3, lossy=False) == (None, 0)
+    assert waiting.take(books, 0.3, lossy=True)[0].items == (0, 0)
