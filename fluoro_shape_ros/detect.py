@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from .centerline import find_ridges, ridge_scale, shrinking
 from .chains import Candidate, find_candidates
 from .data import Outcome
-from .fit import Fit, continues, contrast_ratio, fit, shown
+from .fit import Fit, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
 from .start import first_curve
@@ -27,6 +27,7 @@ ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less 
 EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it
+ASIDE = 0.8             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 NO_TIP = 0.2            # what is left of a line that leaves the field at both ends: it has no tip to show
 
 
@@ -74,7 +75,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
 def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
     fitted = fit(images, fields, views, points, radius, coarse=1)
-    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or continues(images, fields, views, fitted, radius):
+    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or fitted.aside.max() > ASIDE:
         return None
     ends = np.linspace(fitted.start, fitted.stop, 100)
     return Detection(fitted, Outcome.OK, 'ok', tuple(distort(v, project(v.P, fitted.spline(ends))) for v in views))

@@ -29,7 +29,7 @@ GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how m
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
-ASIDE = 0.8             # darkness beside the extension of a fit, as a share of the device's, that makes a tracked fit suspect
+END_PX = 24             # of the device, that must show it
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther
 
 
@@ -52,6 +52,7 @@ class Fit:
     odd_width: float            # by how much that is more than usual, see strips.odd_width
     likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder so wide
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
+    aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
 
 
 def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = COARSE) -> Fit | None:
@@ -108,7 +109,8 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
     if agreed:
         strips, seen = look(found, s, within)
         found, ends = _finish(solve(spline, s, strips, seen, views, within, agreed), s, strips, seen, reference, beyond, half_width, radius)
-    return _see_ends(look, found, ends, half_width, radius)
+    found = _see_ends(look, found, ends, half_width, radius)
+    return replace(found, aside=_aside(images, fields, views, found, half_width))
 
 
 def _look(images, fields, views, own: np.ndarray, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
@@ -164,7 +166,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
             dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
             start_stop[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
     found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, np.linalg.inv(solution.information), s, presence, solution.offset_px.T,
-                contrast, across, width, odd_width(width, float(np.mean(half_width))), alike, np.nan_to_num(beyond))
+                contrast, across, width, odd_width(width, float(np.mean(half_width))), alike, np.nan_to_num(beyond), np.zeros((2, 2)))
     return found, ends
 
 
@@ -206,16 +208,20 @@ def contrast_ratio(f: Fit) -> float:
     return float(min(c.max() / max(c.min(), 1e-6) for c in (f.contrast, f.across)))
 
 
-def continues(images, fields, views, f: Fit, radius: float) -> bool:
-    """Whether the device goes on beside the fit's ends, where the curve may have lost it: a line as dark as the device within WIDE_PX, in either plane."""
-    step = f.s[1] - f.s[0]
-    half_width = [radius * pixels_per_metre(v.P, f.spline(np.array([f.start, f.stop]))) for v in views]
-    reach, px = half_width_range(max(half_width)), np.arange(-80, 20)
+def ends_shown(f: Fit) -> np.ndarray:
+    """(2, 2) presence of the device in its last END_PX, first and last end (rows), plane A, B; 1 where it leaves the field."""
+    px = END_PX * (f.s[1] - f.s[0])
+    last = [f.presence[(f.s > low) & (f.s < high)] for low, high in ((f.start, f.start + px), (f.stop - px, f.stop))]
+    return np.stack([np.ones(2) if leaves or not len(p) else np.nan_to_num(p).clip(0, 1).mean(axis=0) for p, leaves in zip(last, f.open_end)])
+
+
+def _aside(images, fields, views, f: Fit, half_width) -> np.ndarray:
+    """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B; 0 where it leaves the field."""
+    reach, px, dark = half_width_range(max(half_width)), np.arange(-80, 20), np.zeros((2, 2))
     for k, (end, outward) in enumerate(((f.start, -1), (f.stop, 1))):
         if not f.open_end[k]:
-            s = end + outward * px * step
+            s = end + outward * px * (f.s[1] - f.s[0])
             strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), reach + WIDE_PX)
             line = search(strips, _shadows(half_width, np.arange(-reach, reach + 1)))
-            if np.median(line.presence[:, (px > 6) & (px < 18)], axis=1).max() > ASIDE:
-                return True
-    return False
+            dark[k] = np.median(line.presence[:, (px > 6) & (px < 18)], axis=1)
+    return dark

@@ -8,7 +8,7 @@ from .config import Config
 from .curve import curvature
 from .data import Outcome
 from .detect import evidence
-from .fit import Fit, contrast_ratio, shown
+from .fit import Fit, contrast_ratio, ends_shown, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
 MAX_ODD_WIDTH = 0.15    # see strips.odd_width: robot_radius may be off by a third
@@ -16,7 +16,9 @@ MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
 MIN_BEYOND = -0.25      # darkness past an end, in both planes: what is brighter there lies beside something dark, and the device turns aside
-MAX_END_SIGMA, MAX_END_PX = 1.5e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
+MAX_ASIDE = 0.7         # darkness, in both planes, of a line beside where an end would go on
+MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane
+MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see detect.evidence, for a length of 1 m
 
@@ -39,8 +41,10 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
     for k, name in enumerate(('first', 'last')):
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * (f.s[1] - f.s[0]))):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
-        if not f.open_end[k] and f.beyond[k].max() < MIN_BEYOND:
+        if not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE):
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
+        if ends_shown(f)[k].min() < MIN_END_SHOWN:
+            return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
     if evidence(f) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):

@@ -70,7 +70,7 @@ def device(**other):
     clear = dict(spline=straight, start=0.0, stop=0.06, end_sigma=np.full(2, 5e-5), open_end=np.array([False, False]),
                  covariance=np.eye(30) * 1e-10, s=S, presence=present, offset_px=np.zeros((len(S), 2)),
                  contrast=np.array([0.25, 0.25]), across=np.array([0.25, 0.25]), width=0.9, odd_width=0.0,
-                 likeness=np.array([0.99, 0.99]), beyond=np.zeros((2, 2)))
+                 likeness=np.array([0.99, 0.99]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)))
     return Fit(**clear | other)
 
 
@@ -100,6 +100,8 @@ def test_a_clear_device_raises_no_doubt():
     (dict(beyond=np.array([[0.9, 0.0], [0.0, 0.0]])), Outcome.DIRECTIONS_DISAGREE, 'first end'),
     (dict(beyond=np.array([[0.0, 0.0], [0.0, 0.9]])), Outcome.DIRECTIONS_DISAGREE, 'last end'),
     (dict(beyond=np.array([[0.0, 0.0], [-0.4, -0.3]])), Outcome.POORLY_EXPLAINED, 'last end'),
+    (dict(aside=np.array([[0.0, 0.9], [0.9, 0.8]])), Outcome.POORLY_EXPLAINED, 'last end'),
+    (dict(presence=hidden(0.055, 0.07, 1)), Outcome.DIRECTIONS_DISAGREE, 'last end'),
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
 ])
 def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
