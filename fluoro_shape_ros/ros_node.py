@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
@@ -15,7 +15,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.cameras import BadCameraInfo
@@ -31,12 +30,11 @@ from .outputs import Outputs
 from .pairing import PLANES, Pairer
 from .pipeline import reconstruct
 from .prior import newest
-from .subscriptions import AdaptiveSubscription, path_of, surviving, unheard
+from .subscriptions import Inputs, path_of, surviving
 from .transforms import TfMissing, TfPoses, import_tf
 from .waiting import CameraBook, Pair, WaitingRoom
 from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
 
-IMAGE_DEPTH, INFO_DEPTH = 5, 10
 PREDICTIONS = 256       # that are kept: a model may tell them faster than images come
 OVERDUE_S = 5.0         # a pair takes a fraction of a second; one that takes longer is told
 
@@ -50,8 +48,7 @@ class FluoroShapeNode(Node):
     def __init__(self):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
-        self._enabled, self._levels, self._room = True, None, WaitingRoom()
-        self._overdue, self._senders = False, dict.fromkeys(PLANES, 0)
+        self._enabled, self._overdue, self._levels, self._room = True, False, None, WaitingRoom()
         self._predictions = deque(maxlen=PREDICTIONS)
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
@@ -62,7 +59,7 @@ class FluoroShapeNode(Node):
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10), qos_overriding_options=overridable)
         self._answered = self.create_guard_condition(self._report_changes)
         self._worker = Worker(self._work, self._failed)
-        self._inputs = {}
+        self._inputs = None
         self._listen()
         self.create_subscription(Path, 'predicted_backbone', surviving(self._on_prediction, self._bug), QoSProfile(depth=1),
                                  qos_overriding_options=overridable, raw=True)
@@ -86,21 +83,13 @@ class FluoroShapeNode(Node):
 
     def _listen(self) -> None:
         """(Re)make the subscriptions to images and camera infos."""
-        for old in self._inputs.values():
-            old.destroy()
+        if self._inputs is not None:
+            self._inputs.destroy()
         given = self._config.input
         if given.geometry == 'tf' and self._lookup is None:
             self._lookup = TfPoses(self)
-        # camera infos first: the executor takes them in this order, and an image needs its camera
-        for plane in PLANES:
-            self._inputs[f'camera info {plane}'] = AdaptiveSubscription(
-                self, CameraInfo, f'plane_{plane}/camera_info', surviving(partial(self._on_camera_info, plane), self._bug), INFO_DEPTH, given.image_reliability)
-        for plane in PLANES:
-            topic, kind = self.resolve_topic_name(f'plane_{plane}/image_raw'), Image
-            if given.image_transport == 'compressed':   # beside the image wherever that was remapped to, as image_transport does it
-                topic, kind = f'{topic}/compressed', CompressedImage
-            self._inputs[f'image {plane}'] = AdaptiveSubscription(
-                self, kind, topic, surviving(partial(self._on_image, plane), self._bug), IMAGE_DEPTH, given.image_reliability)
+        self._inputs = Inputs(self, given.image_transport, given.image_reliability,
+                              *(surviving(callback, self._bug) for callback in (self._on_image, self._on_camera_info)))
 
     def _on_image(self, plane: str, msg) -> None:
         self._tally.event(f'image {plane}')
@@ -154,8 +143,7 @@ class FluoroShapeNode(Node):
 
     def _hand_over(self) -> None:
         """Give the newest pair whose cameras are known to the worker."""
-        lossy = any(self._inputs[f'camera info {plane}'].best_effort for plane in PLANES)
-        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic(), lossy)
+        pair, lost = self._room.take(tuple(self._books.values()), time.monotonic(), self._inputs.infos_may_be_lost)
         if pair is not None:
             cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
             prediction = newest(self._predictions, pair.stamps[0])
@@ -260,9 +248,7 @@ class FluoroShapeNode(Node):
 
     def _statuses(self) -> list:
         gap = self._pairer.gap_ns
-        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, unheard=partial(unheard, self._inputs, plane),
-                                    reliability='best_effort' if self._inputs[f'image {plane}'].best_effort else 'reliable',
-                                    fell_back=self._inputs[f'image {plane}'].fell_back, publishers=self._senders[plane]) for plane in PLANES]
+        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, **self._inputs.known(plane)) for plane in PLANES]
         pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)
         fault = self._tally.reason('prediction')
         still = 'use_sim_time is set, but there is no /clock' if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else ''
@@ -291,7 +277,7 @@ class FluoroShapeNode(Node):
             self._report(statuses)
 
     def _on_second(self) -> None:
-        self._senders = {plane: self._inputs[f'image {plane}'].publishers for plane in PLANES}
+        self._inputs.count()
         self._hand_over()
         self._report(self._statuses())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import ParameterDescriptor
@@ -11,9 +12,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from msg_adapters.shapes import BadPath
 
+from .pairing import PLANES
+
+IMAGE_DEPTH, INFO_DEPTH = 5, 10
 MAX_PATH_BYTES = 2**18  # some 3000 poses; making Python objects of a million would keep the node busy for a minute
 RELIABILITIES = ('auto', 'reliable', 'best_effort')
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
@@ -21,9 +26,9 @@ _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABI
 
 def surviving(callback: Callable, failed: Callable[[Exception], None]) -> Callable:
     """`callback`, but an exception of it goes to `failed`: a message must not take the node with it."""
-    def call(msg):
+    def call(*arguments):
         try:
-            callback(msg)
+            callback(*arguments)
         except Exception as error:  # the last line of defence, see worker.Worker
             failed(error)
     return call
@@ -112,6 +117,39 @@ def _reliability(node: Node, topic: str, image_reliability: str) -> str:
     return image_reliability if value == 'auto' else value
 
 
-def unheard(subscriptions: dict[str, AdaptiveSubscription], plane: str) -> str:
-    """The topics of a plane that nobody publishes, in words; empty where all are published."""
-    return ' and '.join(s.topic for s in (subscriptions[f'image {plane}'], subscriptions[f'camera info {plane}']) if not s.publishers)
+class Inputs:
+    """The images and camera infos of both planes; `on_image(plane, msg)` and `on_camera_info(plane, msg)` get what comes."""
+
+    def __init__(self, node: Node, image_transport: str, image_reliability: str, on_image: Callable, on_camera_info: Callable):
+        # camera infos first: the executor takes them in this order, and an image needs its camera
+        self._infos = {plane: AdaptiveSubscription(node, CameraInfo, f'plane_{plane}/camera_info', partial(on_camera_info, plane), INFO_DEPTH, image_reliability)
+                       for plane in PLANES}
+        kind, suffix = (CompressedImage, '/compressed') if image_transport == 'compressed' else (Image, '')
+        self._images = {}
+        for plane in PLANES:    # beside the image wherever that was remapped to, as image_transport does it
+            topic = node.resolve_topic_name(f'plane_{plane}/image_raw') + suffix
+            self._images[plane] = AdaptiveSubscription(node, kind, topic, partial(on_image, plane), IMAGE_DEPTH, image_reliability)
+        self._publishers = dict.fromkeys(PLANES, 0)
+
+    def destroy(self) -> None:
+        for subscription in (*self._infos.values(), *self._images.values()):
+            subscription.destroy()
+
+    def count(self) -> None:
+        """Look anew how many publish the images: too slow to be asked for each of them."""
+        self._publishers = {plane: images.publishers for plane, images in self._images.items()}
+
+    @property
+    def infos_may_be_lost(self) -> bool:
+        """Whether a camera info that was lost is not sent again."""
+        return any(infos.best_effort for infos in self._infos.values())
+
+    def known(self, plane: str) -> dict:
+        """What a PlaneSummary tells of them."""
+        images = self._images[plane]
+        return dict(unheard=partial(self._unheard, plane), reliability='best_effort' if images.best_effort else 'reliable', fell_back=images.fell_back,
+                    publishers=self._publishers[plane])
+
+    def _unheard(self, plane: str) -> str:
+        """The topics of a plane that nobody publishes, in words; empty where all are published."""
+        return ' and '.join(s.topic for s in (self._images[plane], self._infos[plane]) if not s.publishers)
