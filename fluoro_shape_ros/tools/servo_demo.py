@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -58,6 +59,7 @@ def _run(args) -> int:
     for module, extra in (('rclpy', 'ros'), ('nav_msgs', 'ros'), ('matplotlib', 'plot')):
         cli.need(module, extra)
     from ..sim.publisher import use_large_image_profile
+    signal.signal(signal.SIGTERM, signal.default_int_handler)      # no child may outlive the demo
     args.out.mkdir(parents=True, exist_ok=True)
     os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     use_large_image_profile()

@@ -21,7 +21,7 @@ from .servo_referee import Record, Referee
 SPEED = 0.006           # m/s, of a target that moves
 SETTLED, STEADY = 0.12e-3, 6    # m; pairs: the tip has arrived when so many in a row were measured as near as that
 TARGET_S = 10.0         # by the robot's clock, for a target
-STALL_S = 120.0         # by the wall's clock, without a pair
+STALL_S = 120.0         # by the wall's clock, without a measured tip
 
 
 @dataclass(frozen=True)
@@ -95,15 +95,15 @@ class Course:
         self.referee, self.record, self._children, self._out = referee, referee.record, children, out
 
     def until(self, condition: Callable[[], object]) -> None:
-        """Serve until `condition()`; raises ToolError where no pair came for STALL_S or a process has ended."""
-        seen, alive = self.referee.now, time.monotonic()
+        """Serve until `condition()`; raises ToolError where no tip was measured for STALL_S or a process has ended."""
+        seen, alive = len(self.record.measured), time.monotonic()
         while not condition():
             self.referee.spin(0.05)
             check_alive(self._children, self._out)
-            if self.referee.now != seen:
-                seen, alive = self.referee.now, time.monotonic()
+            if len(self.record.measured) != seen:
+                seen, alive = len(self.record.measured), time.monotonic()
             if time.monotonic() > alive + STALL_S:
-                raise ToolError(f'no pair came for {STALL_S:g} s, see the logs in {self._out}')
+                raise ToolError(f'no tip was measured for {STALL_S:g} s, see the logs in {self._out}')
 
     def along(self, path: np.ndarray, blackout: bool) -> tuple[int, int]:
         """Move the target along the (N, 3) path at SPEED, with a blackout halfway if asked for; the stamps of start and end."""
