@@ -20,7 +20,7 @@ EXECUTABLES = {
 WHEELS = '; sys_platform == "linux" and platform_machine == "x86_64"'
 EXTRAS = {
     'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp')],
-    'bags': ['rosbags>=0.10', 'mcap>=1.2', 'pyyaml>=6.0'],
+    'bags': ['rosbags>=0.10', 'mcap>=1.2', 'zstandard>=0.22', 'pyyaml>=6.0'],
     'report': ['plotly>=5.18'],
     'dicom': ['pydicom>=3.0.1', 'python-gdcm>=3.0.24.1'],     # GDCM decodes the lossless JPEG that most angiographs write
     'vtk': ['vtk>=9.3'],

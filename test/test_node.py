@@ -295,7 +295,7 @@ def test_a_best_effort_publisher_is_heard(node, stream):
     """Beside the reliable one; diagnostics say so, and with best-effort gone it is heard reliably again."""
     with Client(ReliabilityPolicy.BEST_EFFORT, start_ns=stream.now_ns) as client:
         assert client.connected() and client.good(), node.log
-        assert client.value('plane a', 'reliability') == 'best_effort'
         assert client.hears('best-effort')
+        assert client.value('plane a', 'reliability') == 'best_effort'
         stream.now_ns = client.now_ns
     assert stream.good()
