@@ -29,6 +29,7 @@ GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how m
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
+OPAQUE, ROUND = 0.5, 0.99      # contrast and likeness of a line that is a device, whatever its width
 END_PX = 24             # of the device, that must show it
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther
 
@@ -153,6 +154,8 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
     scale = np.array(half_width) / radius
     across = 1 - (1 - contrast) ** np.clip(np.median(strips.speed[:, between], axis=1) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
     width, alike = apparent_width([pieces(p, between & i) for p, i in zip(strips.profiles, strips.inside)], half_width)
+    opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line
+    odd = 0.0 if opaque else odd_width(width, float(np.mean(half_width)))
     ends, open_end = [None, None], np.zeros(2, bool)
     start_stop = list(reference)
     for k, outward in enumerate((-1, 1)):
@@ -166,7 +169,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
             dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
             start_stop[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
     found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, np.linalg.inv(solution.information), s, presence, solution.offset_px.T,
-                contrast, across, width, odd_width(width, float(np.mean(half_width))), alike, np.nan_to_num(beyond), np.zeros((2, 2)))
+                contrast, across, width, odd, alike, np.nan_to_num(beyond), np.zeros((2, 2)))
     return found, ends
 
 
