@@ -45,6 +45,12 @@ def curvature(points: np.ndarray) -> np.ndarray:
     return 2 * np.linalg.norm(np.cross(a, b), axis=1) / np.maximum(sides, 1e-30)
 
 
+def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """The median along an axis, of an even number the upper one of the middle two; several times as fast as NumPy's."""
+    k = values.shape[axis] // 2
+    return np.partition(values, k, axis=axis).take(k, axis=axis)
+
+
 def distance_to(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     """(N,) distance of (N, d) points to the nearer of the two segments of the (M, d) polyline that meet at its nearest vertex."""
     near = np.clip(cKDTree(line).query(points)[1][:, None] + [-1, 0], 0, len(line) - 2)

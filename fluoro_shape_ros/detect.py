@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from .data import Outcome
 from .fit import Fit, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
+from .planes import both
 from .start import first_curve
 from .strips import apparent_width, cut_along, half_width_range, odd_width, pieces
 
@@ -45,8 +45,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     """Search both whole images (H, W float32, dark device) for the device of `radius` m."""
     center = isocenter(views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in views]
-    with ThreadPoolExecutor(2) as pool:         # NumPy and OpenCV let go of the interpreter: both planes at once
-        candidates = list(pool.map(candidates_of, images, fields, widths, [min_length_px] * 2))
+    candidates = both(candidates_of, images, fields, widths, [min_length_px] * 2)
     best = tuple(c[0].points_px if c else None for c in candidates)
     for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if not found:

@@ -24,15 +24,15 @@ FLOOR_PX = 0.12         # what the model of the edge itself is worth
 
 def supported(presence: np.ndarray) -> tuple[int, int] | None:
     """First and last index of the device's stretch of (N, 2) presence (NaN: outside the field), steps of about a pixel; None where there is none."""
-    smooth = cv2.blur(np.nan_to_num(np.clip(presence, -1, 2)).astype(np.float32), (1, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.blur(np.nan_to_num(presence.clip(-1, 2)).astype(np.float32), (1, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE)
     both, either = (smooth > PRESENT).all(axis=1), (smooth > PRESENT).any(axis=1)
     at = np.nonzero(both)[0]
     if len(at) < 5:
         return None
-    gaps = np.nonzero(np.diff(at) > 1)[0]
+    gaps = np.nonzero(np.diff(at) > GAP_PX)[0]
     # a gap is bridged when it is short, or when one plane shows the device nearly all the way
-    cut = [g for g in gaps if at[g + 1] - at[g] > GAP_PX and not (at[g + 1] - at[g] <= BRIDGED_PX and either[at[g]:at[g + 1]].mean() > 0.8)]
-    starts, stops = np.r_[0, np.array(cut, int) + 1], np.r_[np.array(cut, int), len(at) - 1]
+    cut = [g for g in gaps if not (at[g + 1] - at[g] <= BRIDGED_PX and either[at[g]:at[g + 1]].mean() > 0.8)]
+    starts, stops = [0, *(g + 1 for g in cut)], [*cut, len(at) - 1]
     best = np.argmax([both[at[i]:at[j] + 1].sum() for i, j in zip(starts, stops)])
     return int(at[starts[best]]), int(at[stops[best]])
 
@@ -72,46 +72,61 @@ class End:
         return float(np.hypot(self.sigma, self.apart / 2)) if self.apart > bounds else self.sigma
 
 
-def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: float, outward: int, beyond: np.ndarray,
-           ramp: float = 0.0, density: float = 1.0, reach_px: float = REACH_PX) -> End:
-    """Where the device ends.
+def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray, outward: np.ndarray, beyond: np.ndarray,
+           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX) -> list[End]:
+    """Where the device ends, for E ends at once.
 
-    s: (N,) m. presence: (N, 2), sigma: (2,) its noise, speed: (N, 2) px per m. outward: +1 for the end at large s, -1 at small.
-    beyond: (2,) m, see `bulge`. ramp: m over which the end fades in the more foreshortened plane; its model is worth RAMP of that.
+    s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,) +1 for an end at large s, -1 at
+    small. beyond: (E, 2) m, see `bulge`. ramp: (E,) m over which the end fades in the more foreshortened plane; its model is worth RAMP of that.
     density: strips a px, so many of which are one observation. reach_px: how far from the guess it is looked for.
     Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
     clipped at 3.5 sigma.
     """
-    px_per_m = np.mean(speed[int(np.argmin(np.abs(s - guess)))])
-    near = np.abs(s - guess) * px_per_m < reach_px + 12
-    rows = {v: near & np.isfinite(presence[:, v]) for v in range(2) if np.isfinite(sigma[v])}
-    rows = {v: r for v, r in rows.items() if r.sum() >= 12}
-    seen_at, seen_sigma = np.full(2, np.nan), np.full(2, np.nan)
-    if not rows:
-        return End(guess, float('inf'), seen_at, seen_sigma)
+    e = np.arange(len(s))
+    px_per_m = speed[e, :, np.abs(s - guess[:, None]).argmin(axis=1)].mean(axis=1)
+    near = np.abs(s - guess[:, None]) * px_per_m[:, None] < reach_px + 12
+    at = np.minimum(near.argmax(axis=1)[:, None] + np.arange(near.sum(axis=1).max()), s.shape[1] - 1)
+    y, speed, s, near = presence[e[:, None], :, at].transpose(0, 2, 1), speed[e[:, None], :, at].transpose(0, 2, 1), s[e[:, None], at], near[e[:, None], at]
+    counted = near[:, None] & np.isfinite(y) & np.isfinite(sigma)[..., None]
+    counted &= counted.sum(axis=2, keepdims=True) >= 12
+    y = np.where(counted, y, 0.0)
+    weight = np.where(counted.any(axis=2), 1 / (density * np.maximum(np.nan_to_num(sigma, posinf=0.0), 0.02) ** 2), 0.0)        # (E, 2)
 
-    def edges(v: int, end: np.ndarray, blurs) -> tuple[np.ndarray, np.ndarray, float]:
-        """(E,) cost and information of edges at `end` in plane v, with the blur that fits best."""
-        y, weight = presence[rows[v], v], 1 / (density * max(sigma[v], 0.02) ** 2)
-        z = (outward * (end[:, None] - s[rows[v]]) + beyond[v]) * speed[rows[v], v]     # (E, n) px inside the device
-        tried = []
-        for blur in blurs:
-            m = ndtr(z / blur)
-            a = np.clip((m @ y) / np.maximum((m * m).sum(axis=1), 1e-9), 0.5, 1.8)
-            cost = np.minimum((y - a[:, None] * m) ** 2 * weight * density, 12).sum(axis=1) / density
-            slope = a[:, None] * np.exp(-0.5 * (z / blur) ** 2) / (blur * np.sqrt(2 * np.pi)) * speed[rows[v], v]
-            tried.append((cost, (slope**2).sum(axis=1) * weight, blur))
-        return min(tried, key=lambda t: t[0].min())
+    def edges(ends: np.ndarray, blur: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of edges at (E, C) `ends` with blurs (..., E, 2): (..., E, 2, C) cost and height, and (E, 2, C, n) px that each strip lies inside the device."""
+        z = ((outward[:, None, None] * (ends[:, :, None] - s[:, None]))[:, None] + beyond[..., None, None]) * speed[:, :, None]
+        m = ndtr(z / blur[..., None, None]) * counted[:, :, None]
+        a = np.clip((m @ y[..., None])[..., 0] / np.maximum(np.einsum('...n,...n->...', m, m), 1e-9), 0.5, 1.8)
+        rest = y[:, :, None] - a[..., None] * m
+        return np.einsum('...n->...', np.minimum(rest * rest * (weight * density)[..., None, None], 12)) / density, a, z
 
-    model = (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean()) ** 2 + (RAMP * ramp) ** 2
-    wide = guess + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m
-    coarse = {v: edges(v, wide, BLURS_PX) for v in rows}
-    for v, (cost, information, _) in coarse.items():
-        seen_at[v], seen_sigma[v] = _lowest(wide, cost), np.sqrt(1 / (information[np.argmin(cost)] + 1e-12) + model)
-    fine = wide[np.argmin(sum(c[0] for c in coarse.values()))] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m
-    seen = [edges(v, fine, [coarse[v][2]]) for v in rows]
-    cost, information = sum(c for c, _, _ in seen), sum(i for _, i, _ in seen)
-    return End(_lowest(fine, cost), float(np.sqrt(1 / (information[np.argmin(cost)] + 1e-12) + model)), seen_at, seen_sigma)
+    def information(z: np.ndarray, a: np.ndarray, blur: np.ndarray) -> np.ndarray:
+        """(E, 2) 1/m^2 that an edge tells: z (E, 2, n) px inside the device, its height and blur (E, 2)."""
+        slope = (a / (blur * np.sqrt(2 * np.pi)))[..., None] * np.exp(-0.5 * (z / blur[..., None]) ** 2) * speed * counted
+        return (slope * slope).sum(axis=2) * weight
+
+    both = e[:, None], np.arange(2)
+    model = (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean(axis=1)) ** 2 + (RAMP * ramp) ** 2
+    wide = guess[:, None] + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m[:, None]
+    cost, a, z = edges(wide, np.broadcast_to(np.reshape(BLURS_PX, (-1, 1, 1)), (len(BLURS_PX), len(s), 2)))
+    best = cost.min(axis=3).argmin(axis=0)
+    cost, a, blur = cost[best, *both], a[best, *both], np.array(BLURS_PX)[best]
+    lowest = cost.argmin(axis=2)
+    seen_sigma = np.sqrt(1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12) + model[:, None])
+    fine = wide[e, cost.sum(axis=1).argmin(axis=1)][:, None] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None]
+    fine_cost, a, z = edges(fine, blur)
+    fine_cost = fine_cost.sum(axis=1)
+    k = fine_cost.argmin(axis=1)
+    sigma = np.sqrt(1 / (information(z[e, :, k], a[e, :, k], blur).sum(axis=1) + 1e-12) + model)
+    ends = []
+    for i in e:
+        seen = weight[i] > 0
+        if seen.any():
+            seen_at = np.array([_lowest(wide[i], c) for c in cost[i]])
+            ends.append(End(_lowest(fine[i], fine_cost[i]), float(sigma[i]), np.where(seen, seen_at, np.nan), np.where(seen, seen_sigma[i], np.nan)))
+        else:
+            ends.append(End(float(guess[i]), float('inf'), np.full(2, np.nan), np.full(2, np.nan)))
+    return ends
 
 
 def _lowest(x: np.ndarray, y: np.ndarray) -> float:

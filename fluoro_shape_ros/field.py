@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
 SHRINK = 4              # the field is found at a quarter of the resolution: two halvings
-DARK = 0.12             # darker than this share of the bright level counts as not exposed
+DARK = 0.12             # darker than this share of the bright level counts as not exposed ...
+BRIGHT = 0.95           # ... which this share of the pixels does not exceed
 OPENING = 9             # small-image px: a device is thinner, a blade is wider
 
 
@@ -21,7 +24,10 @@ def field_of_view(image: np.ndarray) -> np.ndarray:
         small = cv2.resize(small, (-(-small.shape[1] // 2), -(-small.shape[0] // 2)), interpolation=cv2.INTER_AREA)
     small = small.astype(np.float32)
     small -= min(0.0, float(small.min()))
-    dark = (small < DARK * np.percentile(small, 95)).astype(np.uint8)
+    some = small.ravel()[::7]
+    dark = (small < DARK * np.partition(some, int(BRIGHT * len(some)))[int(BRIGHT * len(some))]).astype(np.uint8)
+    if not dark.any():
+        return _open(h, w)
     framed = cv2.copyMakeBorder(dark, OPENING, OPENING, OPENING, OPENING, cv2.BORDER_REPLICATE)
     framed = cv2.morphologyEx(framed, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OPENING, OPENING)))
     dark = framed[OPENING:-OPENING, OPENING:-OPENING]
@@ -29,8 +35,16 @@ def field_of_view(image: np.ndarray) -> np.ndarray:
     outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     blocked = np.isin(labels, outside[outside > 0])
     if not blocked.any():
-        return np.full((h, w), 255, np.uint8)
+        return _open(h, w)
     return cv2.resize((~blocked).astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_NEAREST)
+
+
+@lru_cache(8)
+def _open(h: int, w: int) -> np.ndarray:
+    """All exposed; shared, so not to be written to."""
+    field = np.full((h, w), 255, np.uint8)
+    field.flags.writeable = False
+    return field
 
 
 def border_distance(field: np.ndarray, points_px: np.ndarray) -> np.ndarray:

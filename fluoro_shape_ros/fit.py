@@ -11,17 +11,17 @@ from functools import partial
 
 import numpy as np
 
-from .curve import arc_length
+from .curve import arc_length, middle
 from .extent import End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
-from .solver import EndRow, Solution, solve
+from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import Measurement, Strips, apparent_width, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
+from .strips import Measurement, Model, Strips, apparent_width, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
 
-COARSE, FINE = 2, 3
+COARSE, MEDIUM, FINE = 2, 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 COARSE_STEP = 3         # px between the strips of a coarse round
-SETTLED_PX = 0.05       # a fine round that moves the curve less is the last
+SETTLED_PX = 0.2       # a fine round that moves the curve less is the last
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
 NEAR_END_PX = 8
@@ -31,6 +31,7 @@ UNKNOWN = 1.0           # variance of the curve along its projection, as a share
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
 OPAQUE, ROUND = 0.5, 0.99      # contrast and likeness of a line that is a device, whatever its width
 END_PX = 24             # of the device, that must show it
+OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther
 
 
@@ -69,55 +70,62 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         return None     # it goes to a source
     reach = half_width_range(max(half_width))
     template = _shadows(half_width, np.arange(-reach, reach + 1))
+    cylinder = Model.of(template, np.arange(-reach, reach + 1))
     spline = through(points, EXTENSION_PX * step)
     reference = (0.0, arc_length(points)[-1])
-    grown, length_px = 0, 0.0
-    rounds = [True] * coarse + [False] * FINE
-    while rounds:
-        wide = rounds.pop(0)
+    grown, length_px, fine = 0, 0.0, FINE
+    while True:
         if not spline.stop - spline.start < longest:
             return None     # it has left the images, or turns back and forth in them
-        s = np.arange(spline.start, spline.stop, COARSE_STEP * step if wide else step)
-        strips = cut(images, fields, views, spline(s), spline(s, 1), reach + WIDE_PX if wide else reach)
-        within = (s >= reference[0]) & (s <= reference[1])
-        if wide:
-            spline = solve(spline, s, strips, search(strips, template, smooth=3), views, within).spline
-            continue
-        own = np.stack([own_shadow(p, strips.offsets_px, within & i, e) for p, i, e in zip(strips.profiles, strips.inside, template)])
-        seen = measure(strips, own, within)
-        solution = solve(spline, s, strips, seen, views, within)
-        spline = solution.spline
-        stretch = supported(seen.presence.T)
-        if stretch is None:
-            return None
-        settled = solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, (s[stretch[0]], s[stretch[1]]))).max() < 2 * step
-        reference = (s[stretch[0]], s[stretch[1]])
-        if (rounds and not settled) or grown == GROWTH:
-            continue
+        layout = Layout.of(spline, COARSE_STEP * step)
+        within = (layout.s >= reference[0]) & (layout.s <= reference[1])
+        for _ in range(coarse):
+            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach + WIDE_PX)
+            spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within).spline
+        for _ in range(MEDIUM):
+            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
+            spline = solve(layout, spline, strips, measure(strips, cylinder, within), views, within).spline
+        layout = Layout.of(spline, step)
+        s = layout.s
+        for _ in range(fine):
+            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
+            within = (s >= reference[0]) & (s <= reference[1])
+            own = np.stack([own_shadow(p, strips.offsets_px, within & i, e) for p, i, e in zip(strips.profiles, strips.inside, template)])
+            model = Model.of(own, strips.offsets_px)
+            seen = measure(strips, model, within)
+            solution = solve(layout, spline, strips, seen, views, within)
+            spline = solution.spline
+            stretch = supported(seen.presence.T)
+            if stretch is None:
+                return None
+            before, reference = reference, (s[stretch[0]], s[stretch[1]])
+            if solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, before)).max() < 2 * step:
+                break
         beyond = np.stack([_beyond(seen.presence.T, stretch[0], -1), _beyond(seen.presence.T, stretch[1], 1)])
         goes_on = [bool((b > GOES_ON).all() or (b > GOES_ON_ALONE).any()) for b in beyond]
         gained = (reference[1] - reference[0]) / step - length_px
-        if any(goes_on) and (not grown or gained > NEAR_END_PX):        # look farther, as long as that finds something
-            length_px = (reference[1] - reference[0]) / step
-            spline, shift = prolong(spline, goes_on, GROWTH_PX * step)
-            reference = (reference[0] + shift - goes_on[0] * GROWTH_PX * step, reference[1] + shift + goes_on[1] * GROWTH_PX * step)
-            rounds, grown = [True] + [False] * (FINE - 1), grown + 1
-        else:
+        if not any(goes_on) or grown == GROWTH or (grown and gained <= NEAR_END_PX):
             break
-    look = partial(_look, images, fields, views, own)
+        length_px = (reference[1] - reference[0]) / step        # look farther, as long as that finds something
+        spline, shift = prolong(spline, goes_on, GROWTH_PX * step)
+        reference = (reference[0] + shift - goes_on[0] * GROWTH_PX * step, reference[1] + shift + goes_on[1] * GROWTH_PX * step)
+        coarse, fine, grown = 1, FINE - 1, grown + 1
+    look = partial(_look, images, fields, views, reach, model)
     found, ends = _finish(solution, s, strips, seen, reference, beyond, half_width, radius)
     agreed = _agree(found, ends, views)
     if agreed:
         strips, seen = look(found, s, within)
-        found, ends = _finish(solve(spline, s, strips, seen, views, within, agreed), s, strips, seen, reference, beyond, half_width, radius)
+        found, ends = _finish(solve(layout, spline, strips, seen, views, within, agreed), s, strips, seen, reference, beyond, half_width, radius)
     found = _see_ends(look, found, ends, half_width, radius)
     return replace(found, aside=_aside(images, fields, views, found, half_width))
 
 
-def _look(images, fields, views, own: np.ndarray, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
-    """Strips across a fit at (N,) arc lengths, and what they say of a device whose profile is `own` (2, W)."""
-    strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), (own.shape[1] - 1) // 2)
-    return strips, measure(strips, own, within)
+def _look(images, fields, views, reach_px: float, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
+    """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
+    strips = cut(images, fields, views, f.spline(s.ravel()), f.spline(s.ravel(), 1), reach_px)
+    if s.ndim == 2:
+        strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
+    return strips, measure(strips, model, within)
 
 
 def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
@@ -152,47 +160,47 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
     profile = [mean_profile(p, between & i) for p, i in zip(strips.profiles, strips.inside)]
     contrast = np.array([_contrast(p) for p in profile])
     scale = np.array(half_width) / radius
-    across = 1 - (1 - contrast) ** np.clip(np.median(strips.speed[:, between], axis=1) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
+    across = 1 - (1 - contrast) ** np.clip(middle(strips.speed[:, between]) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
     width, alike = apparent_width([pieces(p, between & i) for p, i in zip(strips.profiles, strips.inside)], half_width)
     opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line
     odd = 0.0 if opaque else odd_width(width, float(np.mean(half_width)))
-    ends, open_end = [None, None], np.zeros(2, bool)
-    start_stop = list(reference)
-    for k, outward in enumerate((-1, 1)):
-        i = min(int(np.searchsorted(s, reference[k])), len(s) - 1)
-        past = inside[i:i + 14] if outward > 0 else inside[max(i - 14, 0):i + 1]
-        if past.all():
-            ends[k] = locate(s, presence, seen.presence_sigma, strips.speed.T, reference[k], outward, *_shape_of_end(strips.speed[:, i], scale, across, radius))
-            start_stop[k] = ends[k].at
-        else:       # it runs out of a field before its end could be seen
-            open_end[k] = True
-            dark = np.nonzero(~lit[i:] if outward > 0 else ~lit[:i + 1][::-1])[0]
-            start_stop[k] = s[min(max(i + outward * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
-    found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, np.linalg.inv(solution.information), s, presence, solution.offset_px.T,
+    at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
+    open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])     # it runs out of a field before its end
+    twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
+    ends = locate(twice(s), twice(seen.presence), twice(seen.presence_sigma), twice(strips.speed), np.array(reference), OUTWARD,
+                  *_shape_of_end(strips.speed[:, at].T, scale, across, radius))
+    start_stop = [end.at for end in ends]
+    for k in np.nonzero(open_end)[0]:
+        dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
+        start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
+        ends[k] = None
+    found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
                 contrast, across, width, odd, alike, np.nan_to_num(beyond), np.zeros((2, 2)))
     return found, ends
 
 
-def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
-    """(2,) m of `bulge` and m over which the end fades in the more foreshortened plane."""
+def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """(2, 2) m of `bulge` at each end (rows) in each plane, and (2,) m over which each end fades in the more foreshortened plane."""
     sine = np.clip(speed / px_per_m, 0.1, 1.0)
-    return bulge(radius, speed, px_per_m, across), radius / float(np.tan(np.arcsin(sine)).min())
+    return bulge(radius, speed, px_per_m, across), radius * (np.sqrt(1 - sine**2) / sine).max(axis=1)
 
 
 def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
     scale, step = np.array(half_width) / radius, f.s[1] - f.s[0]
-    at, sigma = [f.start, f.stop], np.zeros(2)
+    at = np.array([f.start, f.stop])
     window = np.arange(-END_WINDOW_PX, END_WINDOW_PX + END_STEP_PX, END_STEP_PX) * step
+    s = at[:, None] + window
+    strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
+    presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))      # (ends, planes, strips)
+    there = speed[:, :, len(window) // 2]
+    again = locate(s, presence, seen.presence_sigma.reshape(2, 2).T, speed, at, OUTWARD, *_shape_of_end(there, scale, f.across, radius),
+                   density=1 / END_STEP_PX, reach_px=END_REACH_PX)
+    sigma = np.zeros(2)
     for k, end in enumerate(ends):
         if end is not None:
-            outward, s = (-1, 1)[k], end.at + window
-            strips, seen = look(f, s, outward * (s - end.at) < 0)
-            speed = strips.speed[:, len(s) // 2]
-            again = locate(s, seen.presence.T, seen.presence_sigma, strips.speed.T, end.at, outward, *_shape_of_end(speed, scale, f.across, radius),
-                           density=1 / END_STEP_PX, reach_px=END_REACH_PX)
-            at[k], sigma[k] = again.at, replace(end, sigma=again.sigma).honest_sigma(float(speed.mean()))
-    return replace(f, start=at[0], stop=at[1], end_sigma=sigma)
+            at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
+    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma)
 
 
 def _contrast(profile: np.ndarray) -> float:
@@ -220,11 +228,9 @@ def ends_shown(f: Fit) -> np.ndarray:
 
 def _aside(images, fields, views, f: Fit, half_width) -> np.ndarray:
     """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B; 0 where it leaves the field."""
-    reach, px, dark = half_width_range(max(half_width)), np.arange(-80, 20), np.zeros((2, 2))
-    for k, (end, outward) in enumerate(((f.start, -1), (f.stop, 1))):
-        if not f.open_end[k]:
-            s = end + outward * px * (f.s[1] - f.s[0])
-            strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), reach + WIDE_PX)
-            line = search(strips, _shadows(half_width, np.arange(-reach, reach + 1)))
-            dark[k] = np.median(line.presence[:, (px > 6) & (px < 18)], axis=1)
-    return dark
+    reach, px = half_width_range(max(half_width)), np.arange(-80, 20)
+    s = (np.array([f.start, f.stop])[:, None] + OUTWARD[:, None] * px * (f.s[1] - f.s[0])).ravel()
+    strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), reach + WIDE_PX).halves()
+    line = search(strips, _shadows(half_width, np.arange(-reach, reach + 1)).repeat(2, axis=0))
+    dark = middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
+    return np.where(f.open_end[:, None], 0.0, dark)

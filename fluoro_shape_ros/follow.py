@@ -33,7 +33,7 @@ SEEN = 0.93             # ... and how many of these must be clear, for a path th
 SHARP = 0.35e-3         # m: an end less certain than this may be another one
 
 
-def found_near(guess: Guess, images, fields, views, config: Config) -> Detection | None:
+def found_near(images, fields, views, config: Config, guess: Guess) -> Detection | None:
     """The device near a guess; None where the images show none there that leaves no doubt, so that all of them must be searched.
 
     images, fields: (H, W) float32 (dark device, even noise; needed only within reach_px) and uint8, a pair each.

@@ -6,6 +6,8 @@ coordinates, u to the right, v down. Nothing here looks at an image.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from scipy.linalg import rq
@@ -37,6 +39,13 @@ def make_view(name: str, P, width: int, height: int, distortion: Distortion | No
     if min(abs(K[0, 0]), abs(K[1, 1])) < 1.0:
         raise GeometryError(f'plane {name}: a focal length of {min(abs(K[0, 0]), abs(K[1, 1])):.3g} px is no camera')
     return view
+
+
+def crop(view: View, rows: slice, columns: slice) -> View:
+    """The view of these rows and columns of the image alone."""
+    shift = np.array([[1, 0, -columns.start], [0, 1, -rows.start], [0, 0, 1]], float)
+    d = view.distortion
+    return replace(view, P=shift @ view.P, width=columns.stop - columns.start, height=rows.stop - rows.start, distortion=d and replace(d, K=shift @ d.K))
 
 
 def decompose(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,9 +122,10 @@ def isocenter(views: tuple[View, View]) -> np.ndarray:
 
 def check_scale(views: tuple[View, View], radius: float) -> None:
     """Raises GeometryError where a device of `radius` (m) would be half as wide as an image, or wider, at the `isocenter`: no C-arm stands so near."""
+    center = isocenter(views)[None]
     for v in views:
         with np.errstate(divide='ignore'):
-            half_width_px = radius * pixels_per_metre(v.P, isocenter(views)[None])
+            half_width_px = radius * pixels_per_metre(v.P, center)
         if not half_width_px < min(v.width, v.height) / 4:
             raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be {2 * half_width_px:.3g} px wide where the planes look')
 

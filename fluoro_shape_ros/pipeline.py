@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,17 +12,19 @@ from . import paper
 from .config import Config
 from .curve import arc_length, distance_to, even_steps, resample
 from .data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
-from .detect import detect, track
+from .detect import Detection, detect, track
 from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
 from .follow import curve, found_near, reach_px
-from .geometry import GeometryError, check_pair, check_scale, distort, pixels_per_metre, project, undistort
+from .geometry import GeometryError, check_pair, check_scale, crop, distort, pixels_per_metre, project, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
+from .planes import both
 from .prior import Guess, borne_out, judged, look
 
-REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next
+REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
+EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 
 
@@ -34,7 +37,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
     images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
-    fields = tuple(field_of_view(image) for image in frame.images)
+    fields = both(field_of_view, frame.images)
     clock.lap('prepare')
     by = _by_paper if config.curve.method == 'paper' else _by_spline
     guess, why = look(prior, frame.views, config.curve.prior_sigma)
@@ -47,14 +50,14 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     found = None
     if config.curve.tracking and prior.previous is not None:
         around = [region_around(v, prior.previous.points) for v in frame.views]
-        found = track([stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, radius, prior.previous.points)
+        found = _near(around, track, images, fields, frame.views, polarity, radius, prior.previous.points)
         clock.lap('track')
     if guess is not None and (found is None or not borne_out(curve(found.fit), guess)):
         around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
-        found = found_near(guess, [stable_noise(i, polarity, r) for i, r in zip(images, around)], fields, frame.views, config) or found
+        found = _near(around, found_near, images, fields, frame.views, polarity, config, guess) or found
         clock.lap('follow')
     if found is None:
-        found = detect([stable_noise(i, polarity) for i in images], fields, frame.views, radius, config.detection.min_length_px)
+        found = detect(both(stable_noise, images, [polarity] * 2), fields, frame.views, radius, config.detection.min_length_px)
         clock.lap('detect')
     seen = tuple(None if px is None else Centerline(px) for px in found.seen_px)
     if found.fit is None:
@@ -148,13 +151,29 @@ def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
 
 
 def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] = (slice(None), slice(None))) -> np.ndarray:
-    """(H, W) float32 square root of a dark device's image: quantum noise gets the same variance everywhere (Anscombe). 0 outside `region`."""
-    out = np.zeros(image.shape, np.float32)
+    """Float32 square root of the `region` of a dark device's (H, W) image: quantum noise gets the same variance everywhere (Anscombe)."""
     if image.dtype.kind == 'u' and polarity != 'auto':
-        out[region] = np.sqrt(dark_device(image[region], polarity))
+        dark = dark_device(image[region], polarity)
     else:       # needs the whole image's statistics
-        out[region] = np.sqrt(dark_device(image, polarity)[region])
-    return out
+        dark = dark_device(image, polarity)[region]
+    return np.sqrt(dark, out=dark)
+
+
+def _near(regions, look, images, fields, views, polarity: str, *known) -> Detection | None:
+    """What `look` finds in these regions of both planes; None where it finds nothing, or something that may go on beyond them."""
+    cropped = both(stable_noise, images, [polarity] * 2, regions), [f[r] for f, r in zip(fields, regions)], [crop(v, *r) for v, r in zip(views, regions)]
+    found = look(*cropped, *known)
+    if found is None:
+        return None
+    seen = []
+    for (rows, columns), view, line in zip(regions, views, found.seen_px):
+        last = np.array([columns.stop - columns.start, rows.stop - rows.start])
+        cut_off = np.array([columns.start, rows.start]) > 0, np.array([columns.stop, rows.stop]) < [view.width, view.height]
+        ends = line[[0, -1]]
+        if ((ends < EDGE_PX) & cut_off[0] | (ends > last - EDGE_PX) & cut_off[1]).any():
+            return None
+        seen.append(line + [columns.start, rows.start])
+    return replace(found, seen_px=tuple(seen))
 
 
 def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:

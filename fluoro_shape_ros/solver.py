@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dpbsv
 
+from .curve import middle
 from .geometry import projection_jacobian
 from .spline import Spline3, bending
 from .strips import Measurement, Strips
@@ -17,6 +19,50 @@ MODEL_PX = 0.15         # what the model of a strip is worth (0.03 px, the same 
 BLOCK = 16              # strips over which errors that go together (anatomy, crossings) show
 REDUNDANCY = 1.3        # cubic interpolation correlates neighbouring strips
 REWEIGHTED = 3          # times
+BAND = 12               # unknowns that one strip sees: three of each of four control points
+FLOOR = 1.0             # 1/m^2: no unknown is known less well than to a metre, so that there always is a solution
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Strips at even steps along a spline, and which unknowns each touches: what all rounds of a fit share.
+
+    The Jacobian is tall and mostly zero: its rows are sorted by the piece of the spline whose BAND unknowns each sees, as (n - 3, M) padded tables, and
+    the normal equations are banded.
+    """
+
+    s: np.ndarray           # (N,) m
+    basis: np.ndarray       # (N, n) of the points,
+    slope: np.ndarray       # (N, n) and of the tangents
+    weights: np.ndarray     # (N, 4) of the control points that count
+    at: np.ndarray          # (n - 3, M) strip at each place of the table
+    there: np.ndarray       # (n - 3, M) bool: whether there is one
+    unknowns: np.ndarray    # (n - 3, BAND) index of those that a piece touches
+    band: np.ndarray        # (n - 3, BAND, BAND) where each term of a piece's equations stands in the lower band; past its end for those above the diagonal
+    stiffness: np.ndarray   # (n, n) 1/m^2: a device bends evenly (third differences of the control points)
+
+    @classmethod
+    def of(cls, spline: Spline3, step: float) -> Layout:
+        s, n = np.arange(spline.start, spline.stop, step), len(spline.control)
+        k, b = spline.weights(s)
+        starts = np.searchsorted(k, np.arange(n - 3))
+        counts = np.diff(np.append(starts, len(k)))
+        place = np.arange(counts.max())
+        there = place < counts[:, None]
+        local, first = np.arange(BAND), 3 * np.arange(n - 3)[:, None, None]
+        below = local[:, None] - local
+        band = np.where(below < 0, BAND * 3 * n, below * 3 * n + first + local)
+        D = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
+        return cls(s, spline.basis(s), spline.basis(s, 1), b, np.where(there, starts[:, None] + place, 0), there, first[:, 0] + local, band, D.T @ D)
+
+    def matrix(self, blocks: np.ndarray) -> np.ndarray:
+        """(BAND, 3 n) lower band of the sum of the (n - 3, BAND, BAND) overlapping blocks of the pieces."""
+        size = 3 * len(self.stiffness)
+        return np.bincount(self.band.ravel(), blocks.ravel(), BAND * size + 1)[:-1].reshape(BAND, size)
+
+    def vector(self, parts: np.ndarray) -> np.ndarray:
+        """(3 n,) sum of the (n - 3, BAND) overlapping parts."""
+        return np.bincount(self.unknowns.ravel(), parts.ravel())
 
 
 @dataclass(frozen=True)
@@ -24,40 +70,13 @@ class Solution:
     """A spline after one step of the solver."""
 
     spline: Spline3
-    information: np.ndarray     # (3 n, 3 n) 1/m^2 of the control points
+    information: np.ndarray     # (BAND, 3 n) 1/m^2 of the control points, its lower band
     offset_px: np.ndarray       # (2, N) of the device from the curve, after the step; NaN where not measured
     moved_px: float             # how far the step went, at most
 
-
-@dataclass(frozen=True)
-class Pieces:
-    """The rows of a tall matrix (N, 3 n) sorted by the piece of the spline whose twelve unknowns each touches, as (n - 3, M) padded tables.
-
-    Most of that matrix is zero: each strip sees four control points.
-    """
-
-    at: np.ndarray      # (n - 3, M) strip at each place of the table
-    there: np.ndarray   # (n - 3, M) bool: whether there is one
-    unknowns: np.ndarray    # (n - 3, 12) index of those that a piece touches
-
-    @classmethod
-    def of(cls, k: np.ndarray, n: int) -> Pieces:
-        """From the (N,) ascending pieces of the strips and the number of control points."""
-        starts = np.searchsorted(k, np.arange(n - 3))
-        counts = np.diff(np.append(starts, len(k)))
-        place = np.arange(counts.max())
-        there = place < counts[:, None]
-        return cls(np.where(there, starts[:, None] + place, 0), there, 3 * np.arange(n - 3)[:, None] + np.arange(12))
-
-    def scatter(self, blocks: np.ndarray) -> np.ndarray:
-        """(3 n, 3 n) sum of the (n - 3, 12, 12) overlapping blocks of the pieces."""
-        size = int(self.unknowns[-1, -1]) + 1
-        flat = self.unknowns[:, :, None] * size + self.unknowns[:, None, :]
-        return np.bincount(flat.ravel(), blocks.ravel(), size * size).reshape(size, size)
-
-    def gather(self, parts: np.ndarray) -> np.ndarray:
-        """(3 n,) sum of the (n - 3, 12) overlapping parts."""
-        return np.bincount(self.unknowns.ravel(), parts.ravel())
+    def covariance(self) -> np.ndarray:
+        """(3 n, 3 n) m^2 of the control points."""
+        return dpbsv(self.information, np.eye(self.information.shape[1]), lower=1)[1]
 
 
 @dataclass(frozen=True)
@@ -67,6 +86,11 @@ class EndRow:
     row: np.ndarray     # (3 n,)
     target: float       # m
     variance: float     # m^2
+
+    def band(self) -> np.ndarray:
+        """(BAND, 3 n) 1/m^2: the lower band of what it adds to the normal equations."""
+        full = np.outer(self.row, self.row) / self.variance
+        return np.stack([np.append(np.diagonal(full, k), np.zeros(k)) for k in range(BAND)])
 
     @classmethod
     def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray, views) -> EndRow:
@@ -87,54 +111,55 @@ class EndRow:
         return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
 
 
-def solve(spline: Spline3, s: np.ndarray, strips: Strips, seen: Measurement, views, within: np.ndarray, ends: Sequence[EndRow] = ()) -> Solution:
+def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views, within: np.ndarray, ends: Sequence[EndRow] = ()) -> Solution:
     """One Gauss-Newton step. `ends`: what else must hold.
 
     Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's biweight); prior: third
     differences of the control points. The Jacobian of a projection has rank 2, n picks what is seen across the curve.
     """
-    n = len(spline.control)
-    k, b = spline.weights(s)
-    table = Pieces.of(k, n)
+    n, at = len(spline.control), layout.at
     P = np.stack([v.P for v in views])
-    depth = spline(s) @ P[:, 2, :3].T + P[:, 2, 3]                                                             # (N, 2)
-    along = (strips.normals * strips.centers_px).sum(axis=2)
+    depth = layout.basis @ (spline.control @ P[:, 2, :3].T) + P[:, 2, 3]                                        # (N, 2)
+    along = np.einsum('vnk,vnk->vn', strips.normals, strips.centers_px)
     across = (strips.normals @ P[:, :2, :3] - along[..., None] * P[:, 2:, :3]) / depth.T[..., None]             # (2, N, 3) n . J
-    rows = (b[:, :, None] * across[:, :, None, :]).reshape(2, len(s), 12)[:, table.at]                          # (2, n - 3, M, 12)
-    rows = rows.transpose(1, 0, 2, 3).reshape(n - 3, -1, 12)
-    tabled = lambda x: x[:, table.at].transpose(1, 0, 2).reshape(n - 3, -1)     # noqa: E731
+    rows = (layout.weights[:, :, None] * across[:, :, None, :]).reshape(2, -1, BAND)[:, at]                     # (2, n - 3, M, BAND)
+    rows = rows.transpose(1, 0, 2, 3).reshape(n - 3, -1, BAND)
+    columns = rows.transpose(0, 2, 1)
+    tabled = lambda x: x[:, at].transpose(1, 0, 2).reshape(n - 3, -1)     # noqa: E731
     d = tabled(seen.offset_px)
-    w0 = tabled(within / (REDUNDANCY * seen.variance + MODEL_PX**2)) * np.tile(table.there, 2)
-    prior, pull = _prior(spline, s, k, b, table)
+    w0 = tabled(within / (REDUNDANCY * seen.variance + MODEL_PX**2)) * np.concatenate([layout.there] * 2, axis=1)
+    prior, pull = _prior(layout, spline)
     for end in ends:
-        prior, pull = prior + np.outer(end.row, end.row) / end.variance, pull + end.row * (end.target / end.variance)
-    w, used = w0, w0 > 0
+        prior, pull = prior + end.band(), pull + end.row * (end.target / end.variance)
+    w, root, used = w0, np.sqrt(w0), w0 > 0
     for _ in range(REWEIGHTED):
-        weighted = rows * w[..., None]
-        step = np.linalg.solve(table.scatter(weighted.transpose(0, 2, 1) @ rows) + prior, table.gather((weighted.transpose(0, 2, 1) @ d[..., None])[..., 0]) + pull)
-        moved = (rows @ step[table.unknowns][..., None])[..., 0]
+        normal = layout.matrix((columns * w[:, None]) @ rows) + prior
+        step = dpbsv(normal, layout.vector((columns @ (w * d)[..., None])[..., 0]) + pull, lower=1)[1]
+        moved = (rows @ step[layout.unknowns][..., None])[..., 0]
         r = d - moved
-        z = np.abs(r) * np.sqrt(w0)
-        spread = max(1.0, 1.4826 * float(np.median(z[used]))) if used.any() else 1.0
+        z = r * root
+        spread = max(1.0, 1.4826 * float(middle(np.abs(z[used])))) if used.any() else 1.0
         w = w0 * np.maximum(1 - (z / (5 * spread)) ** 2, 0) ** 2 / spread**2
-    planes = np.broadcast_to(np.arange(2)[:, None], (2, table.at.shape[1])).ravel()     # of each column of the table
-    together = np.array([_together((r * np.sqrt(w))[:, planes == v][used[:, planes == v]]) for v in (0, 1)])
-    information = table.scatter((rows * (w / together[planes])[..., None]).transpose(0, 2, 1) @ rows) + prior
-    offset = np.full((2, len(s)), np.nan)
-    for v in (0, 1):
-        column = planes == v
-        offset[v, table.at[used[:, column]]] = r[:, column][used[:, column]]
+    plane = [slice(0, at.shape[1]), slice(at.shape[1], None)]      # of the table's columns
+    together = np.empty_like(w)
+    offset = np.full((2, len(layout.s)), np.nan)
+    for v, c in enumerate(plane):
+        together[:, c] = _together((r[:, c] * np.sqrt(w[:, c]))[used[:, c]])
+        offset[v, at[used[:, c]]] = r[:, c][used[:, c]]
+    information = layout.matrix((columns * (w / together)[:, None]) @ rows) + prior
     after = Spline3(spline.start, spline.stop, spline.control + step.reshape(n, 3))
     return Solution(after, information, offset, float(np.abs(moved[used]).max(initial=0.0)))
 
 
-def _prior(spline: Spline3, s, k, b, table: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """(3 n, 3 n) and (3 n,): a device bends evenly (third differences), and no step slides it along itself."""
-    n = len(spline.control)
-    D = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
-    stiffness = np.kron(D.T @ D, np.eye(3))
-    slide = (b[:, :, None] * spline(s, 1)[:, None, :]).reshape(-1, 12)[table.at] * ((table.at % 4 == 0) & table.there)[..., None] / SLIDE
-    return stiffness + table.scatter(slide.transpose(0, 2, 1) @ slide), -stiffness @ spline.control.ravel()
+def _prior(layout: Layout, spline: Spline3) -> tuple[np.ndarray, np.ndarray]:
+    """(BAND, 3 n) and (3 n,): a device bends evenly, and no step slides it along itself."""
+    tangents = layout.slope @ spline.control
+    slide = (layout.weights[:, :, None] * tangents[:, None, :]).reshape(-1, BAND)[layout.at[:, ::4]] * (layout.there[:, ::4, None] / SLIDE)
+    band = layout.matrix(slide.transpose(0, 2, 1) @ slide)
+    band[0] += FLOOR
+    for k in range(4):
+        band[3 * k, :band.shape[1] - 3 * k] += np.repeat(np.diagonal(layout.stiffness, k), 3)
+    return band, -(layout.stiffness @ spline.control).ravel()
 
 
 def _together(z: np.ndarray) -> float:

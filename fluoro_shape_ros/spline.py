@@ -11,7 +11,7 @@ from .curve import arc_length, at_arc_length
 KNOT_SPACING = 0.008        # m: a device bends with radii of some cm
 MIN_CONTROL, MAX_CONTROL = 7, 48
 UNIFORM_CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6    # row p: coefficients of u^p of the four weights
-DERIVATIVE = np.diag([1.0, 2.0, 3.0], 1)        # of the powers of u
+DERIVATIVES = UNIFORM_CUBIC, np.diag([1.0, 2.0, 3.0], 1) @ UNIFORM_CUBIC, np.diag([2.0, 6.0], 2) @ UNIFORM_CUBIC
 
 
 @dataclass(frozen=True)
@@ -30,23 +30,21 @@ class Spline3:
         pieces = len(self.control) - 3
         h = (self.stop - self.start) / pieces
         x = (np.asarray(s, float) - self.start) / h
-        k = np.clip(np.floor(x), 0, pieces - 1).astype(int)
+        k = x.astype(int).clip(0, pieces - 1)
         u = x - k
         u2 = u * u
-        powers = np.stack([np.ones_like(u), u, u2, u2 * u], axis=1)
-        return k, powers @ (np.linalg.matrix_power(DERIVATIVE / h, derivative) @ UNIFORM_CUBIC)
+        return k, np.stack([np.ones_like(u), u, u2, u2 * u], axis=1) @ (DERIVATIVES[derivative] / h**derivative)
 
-    def basis(self, s: np.ndarray) -> np.ndarray:
-        """(N, n) basis functions at (N,) arc lengths."""
-        k, b = self.weights(s)
+    def basis(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """(N, n) basis functions, or their derivatives, at (N,) arc lengths."""
+        k, b = self.weights(s, derivative)
         B = np.zeros((len(k), len(self.control)))
-        np.put_along_axis(B, k[:, None] + np.arange(4), b, axis=1)
+        B[np.arange(len(k))[:, None], k[:, None] + np.arange(4)] = b
         return B
 
     def __call__(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
         """(N, 3) points, or derivatives."""
-        k, b = self.weights(s, derivative)
-        return (b[:, None] @ self.control[k[:, None] + np.arange(4)])[:, 0]
+        return self.basis(s, derivative) @ self.control
 
 
 def bending(n: int) -> np.ndarray:

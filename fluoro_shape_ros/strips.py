@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from .curve import middle
 from .data import View
 from .geometry import distort
 
@@ -16,7 +17,7 @@ from .geometry import distort
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
-PIECE = 32              # strips
+PIECE = 31              # strips
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
 WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
 WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
@@ -33,6 +34,12 @@ class Strips:
     offsets_px: np.ndarray  # (W,)
     inside: np.ndarray      # (V, N) bool: the whole strip lies in the exposed field
     lit: np.ndarray         # (V, N) bool: its middle does
+
+    def halves(self) -> Strips:
+        """Both halves of the N strips as if planes of their own showed them: (2 V, N / 2), both of plane A, both of plane B."""
+        half = (2 * len(self.speed), -1)
+        return Strips(*(a.reshape(*half, *a.shape[2:]) for a in (self.centers_px, self.normals, self.speed, self.profiles)), self.offsets_px,
+                      self.inside.reshape(half), self.lit.reshape(half))
 
 
 @dataclass(frozen=True)
@@ -57,12 +64,15 @@ def cut(images, fields, views, points: np.ndarray, tangents: np.ndarray, reach_p
     centers = x[..., :2] / x[..., 2:]
     dx = tangents @ P[:, :, :3].transpose(0, 2, 1)
     step = (dx[..., :2] - centers * dx[..., 2:]) / x[..., 2:]
-    speed = np.linalg.norm(step, axis=-1)
-    tangent = step / np.maximum(speed, 1e-9)[..., None]
-    normals = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    speed = np.hypot(step[..., 0], step[..., 1])
+    normals = np.empty_like(step)
+    np.divide(-step[..., 1], np.maximum(speed, 1e-9), out=normals[..., 0])
+    np.divide(step[..., 0], np.maximum(speed, 1e-9), out=normals[..., 1])
     offsets = np.arange(-reach_px, reach_px + 1)
-    sampled = [_sample(*plane, offsets) for plane in zip(images, fields, views, centers, normals)]
-    profiles, inside, lit = (np.stack(part) for part in zip(*sampled))
+    profiles = np.empty((*speed.shape, len(offsets)), np.float32)
+    inside, lit = np.empty(speed.shape, bool), np.empty(speed.shape, bool)
+    for k, plane in enumerate(zip(images, fields, views, centers, normals)):
+        profiles[k], inside[k], lit[k] = _sample(*plane, offsets)
     return Strips(centers, normals, speed, profiles, offsets, inside, lit)
 
 
@@ -79,10 +89,10 @@ def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], 
 
 def _sample(image, field, view: View | None, centers, normals, offsets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, W) values, (N,) whether the whole strip lies in the field and (N,) whether its middle does."""
-    at = centers[:, None] + offsets[:, None] * normals[:, None]
+    u, v = (c[:, None] + n[:, None] * offsets for c, n in zip(centers.T, normals.T))
     if view is not None and view.distortion is not None:
-        at = distort(view, at.reshape(-1, 2)).reshape(at.shape)
-    u, v = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+        u, v = distort(view, np.stack([u, v], axis=2).reshape(-1, 2)).T.reshape(2, *u.shape)
+    u, v = u.astype(np.float32), v.astype(np.float32)
     profiles = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     ends = [0, len(offsets) // 2, -1]
     exposed = cv2.remap(field, u[:, ends], v[:, ends], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
@@ -114,7 +124,7 @@ def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np
 
     profiles: (B, W) of its pieces in each plane. The median piece counts: some may run along another edge.
     """
-    alike = np.stack([np.median(likeness(p, h), axis=0) if len(p) else np.zeros(len(WIDTHS)) for p, h in zip(profiles, half_width_px)])
+    alike = np.stack([middle(likeness(p, h), axis=0) if len(p) else np.zeros(len(WIDTHS)) for p, h in zip(profiles, half_width_px)])
     best = int(alike.min(axis=0).argmax())
     return float(WIDTHS[best]), alike[:, best]
 
@@ -132,13 +142,13 @@ def pieces(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
     """(B, W) medians of successive PIECE good ones among (N, W) profiles; one of all where there are fewer."""
     profiles = profiles[good]
     if len(profiles) < PIECE:
-        return np.median(profiles, axis=0, keepdims=True) if len(profiles) else profiles
-    return np.median(profiles[:len(profiles) // PIECE * PIECE].reshape(-1, PIECE, profiles.shape[1]), axis=1)
+        return middle(profiles, axis=0)[None] if len(profiles) else profiles
+    return middle(profiles[:len(profiles) // PIECE * PIECE].reshape(-1, PIECE, profiles.shape[1]), axis=1)
 
 
 def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
     """(W,) median of the good ones among (N, W) profiles; all equal where there are none."""
-    return np.median(profiles[good], axis=0) if good.any() else np.ones(profiles.shape[-1])
+    return middle(profiles[good], axis=0) if good.any() else np.ones(profiles.shape[-1])
 
 
 def shadow(half_width_px: float, offsets_px: np.ndarray) -> np.ndarray:
@@ -161,7 +171,7 @@ def own_shadow(profiles: np.ndarray, offsets_px: np.ndarray, good: np.ndarray, e
     """(W,) the device's mean over the `good` ones of (N, W) profiles, made symmetric, unit depth; the `expected` one where there is too little of it."""
     if good.sum() < 20:
         return expected
-    mean = np.median(profiles[good][::2], axis=0)
+    mean = middle(profiles[good][::2], axis=0)
     outer = expected < 0.02
     dark = _line(offsets_px, mean, outer) - mean if outer.sum() > 3 else mean.max() - mean
     dark = 0.5 * (dark + dark[::-1])
@@ -175,35 +185,54 @@ def _line(x: np.ndarray, y: np.ndarray, where: np.ndarray) -> np.ndarray:
     return y[where].mean() + (dx[where] @ dy[where]) / (dx[where] @ dx[where]) * dx
 
 
-def measure(strips: Strips, shadows: np.ndarray, reference: np.ndarray | None = None) -> Measurement:
-    """Least squares of each strip for background (parabola), darkness and shift of its plane's profile T, a row of `shadows` (V, W):
-    I = b0 + b1 x + b2 x^2 - c (T(x) - d T'(x)).
+@dataclass(frozen=True)
+class Model:
+    """What a strip is made of: I = b0 + b1 x + b2 x^2 - c (T(x) - d T'(x)), background, darkness and shift of the device's profile T."""
 
-    `reference` (N,) bool: the strips whose darkness counts as usual; all by default.
+    parts: np.ndarray       # (V, W, 5)
+    solve: np.ndarray       # (V, 5, W) what gives the amount of each by least squares
+
+    @classmethod
+    def of(cls, shadows: np.ndarray, offsets_px: np.ndarray) -> Model:
+        """From the (V, W) profiles."""
+        x = offsets_px / offsets_px[-1]
+        M = np.zeros((*shadows.shape, 5))
+        M[..., 0], M[..., 1], M[..., 2], M[..., 3] = 1, x, x * x, shadows
+        M[:, 1:-1, 4] = 0.5 * (shadows[:, 2:] - shadows[:, :-2])
+        T = M.transpose(0, 2, 1)
+        return cls(M, np.linalg.solve(T @ M, T))
+
+    def twice(self) -> Model:
+        """For Strips.halves."""
+        return Model(self.parts.repeat(2, axis=0), self.solve.repeat(2, axis=0))
+
+
+def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -> Measurement:
+    """Least squares of each strip for what its plane's `model` says it is made of.
+
+    `reference` (N,) or (V, N) bool: the strips whose darkness counts as usual; all by default.
     """
     width = len(strips.offsets_px)
-    x = strips.offsets_px / strips.offsets_px[-1]
-    M = np.stack([*np.broadcast_to(np.stack([np.ones_like(x), x, x**2])[:, None], (3, *shadows.shape)), shadows, np.gradient(shadows, axis=1)], axis=2)
-    fit = np.linalg.pinv(M)                                                     # (V, 5, W)
+    M, fit = model.parts, model.solve
     coefficients = strips.profiles @ fit.transpose(0, 2, 1)
     rest = strips.profiles - coefficients @ M.transpose(0, 2, 1)
-    noise = 1.4826 * np.median(np.abs(rest[:, ::2]).reshape(len(rest), -1), axis=1)[:, None] * np.sqrt(width / (width - 5)) + 1e-9
+    noise = (1.4826 * np.sqrt(width / (width - 5)) * middle(np.abs(rest[:, ::2]).reshape(len(rest), -1)) + 1e-9)[:, None]
     inside = strips.inside
     darkness = np.where(inside, -coefficients[..., 3], np.nan)
-    usual = np.stack([_running_median(d, i if reference is None else i & reference) for d, i in zip(darkness, inside)])
-    usual = np.where(usual > 1e-9, usual, np.nan)       # no darkness at all, or brighter than its surroundings: no device to measure
+    usual = np.stack([_running_median(d, i) for d, i in zip(darkness, inside if reference is None else inside & reference)])
+    usual[~(usual > 1e-9)] = np.nan         # no darkness at all, or brighter than its surroundings: no device to measure
     offset = coefficients[..., 4] / usual
-    gain = np.linalg.norm(fit, axis=2)
-    variance = np.nan_to_num((noise * gain[:, 4:]) ** 2 / usual**2, nan=np.inf)
+    gain = np.sqrt((fit * fit).sum(axis=2))
+    variance = (noise * gain[:, 4:] / usual) ** 2
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
-    square = rest**2
+    square = rest * rest
     limit = 9 * noise**2
-    misfit = uniform_filter1d(np.minimum(square.sum(axis=2) / (width - 5), limit), TOGETHER, axis=1) / noise**2
-    variance = variance * (1 + TOGETHER * np.maximum(misfit - MISFIT, 0))
-    odd = np.minimum(square, limit[..., None]).mean(axis=2) > 3.5 * noise**2    # another edge runs through: not to be trusted
-    variance = np.where(inside & ~odd, variance, np.inf)
-    sigma = np.array([n * g / np.nanmedian(u) if np.isfinite(u).any() else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
-    return Measurement(np.nan_to_num(offset), variance, np.where(inside, darkness / usual, np.nan), sigma)
+    misfit = uniform_filter1d(np.minimum(np.einsum('vnw->vn', square) / (width - 5), limit), TOGETHER, axis=1) / noise**2
+    variance *= 1 + TOGETHER * np.maximum(misfit - MISFIT, 0)
+    odd = np.einsum('vnw->vn', np.minimum(square, limit[..., None])) > 3.5 * width * noise**2   # another edge runs through: not to be trusted
+    variance[~inside | odd | np.isnan(variance)] = np.inf
+    sigma = np.array([n * g / middle(u) if np.isfinite(u[0]) else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
+    return Measurement(np.nan_to_num(offset), variance, darkness / usual, sigma)
 
 
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
@@ -212,16 +241,16 @@ def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     Worth about a pixel; worth nothing where the line found is much fainter or darker than it usually is: there something hides the device.
     """
     half = (shadows.shape[1] - 1) // 2
-    middle = slice(half // 2, -(half // 2) or None)
+    inner = slice(half // 2, -(half // 2) or None)
     kernels = (shadows - shadows.mean(axis=1, keepdims=True)).astype(np.float32)
-    response = np.stack([cv2.blur(-cv2.filter2D(p, cv2.CV_32F, k[None], borderType=cv2.BORDER_REPLICATE), (1, smooth))[:, middle]
+    response = np.stack([cv2.blur(-cv2.filter2D(p, cv2.CV_32F, k[None], borderType=cv2.BORDER_REPLICATE), (1, smooth))[:, inner]
                          for p, k in zip(strips.profiles, kernels)])
     best = np.argmax(response, axis=2)
     darkest = np.take_along_axis(response, best[..., None], axis=2)[..., 0]
-    usual = [max(float(np.median(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)]
+    usual = [max(float(middle(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)]
     strength = darkest / np.array(usual)[:, None]
     believed = strips.inside & (strength > 0.4) & (strength < 2.5)
-    return Measurement(strips.offsets_px[middle][best], np.where(believed, 1.0, np.inf), strength, np.ones(len(strength)))
+    return Measurement(strips.offsets_px[inner][best], np.where(believed, 1.0, np.inf), strength, np.ones(len(strength)))
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:
@@ -231,7 +260,7 @@ def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np
         return np.full(len(values), np.nan)
     width = min(width, len(at))
     blocks = at[:len(at) // width * width].reshape(-1, width)
-    medians = np.median(values[blocks], axis=1)
-    overall = float(np.median(medians))
-    medians = np.clip(medians, 0.4 * overall, 2.5 * overall) if overall > 0 else medians
+    medians = middle(values[blocks])
+    overall = float(middle(medians))
+    medians = medians.clip(0.4 * overall, 2.5 * overall) if overall > 0 else medians
     return np.interp(np.arange(len(values)), blocks.mean(axis=1), medians)

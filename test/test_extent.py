@@ -65,9 +65,9 @@ def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):
     return ndtr(z / blur_px) + np.random.default_rng(seed).normal(0, noise, z.shape)
 
 
-def placed(*arguments):
+def placed(s, presence, sigma, speed, guess, outward, beyond):
     """m: where the device ends, and its standard deviation."""
-    end = locate(*arguments)
+    end, = locate(s[None], presence.T[None], sigma[None], speed.T[None], np.array([guess]), np.array([outward]), beyond[None], np.zeros(1))
     return end.at, end.honest_sigma(SPEED.mean())
 
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry import (GeometryError, check_pair, check_scale, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
+from fluoro_shape_ros.geometry import (GeometryError, check_pair, check_scale, crop, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
                                        pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
 
 K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])
@@ -28,6 +28,17 @@ def test_jacobian_is_the_derivative_of_project():
     X, h = np.array([0.01, -0.02, 0.03]), 1e-6
     numeric = np.stack([(project(B.P, X + h * e) - project(B.P, X - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     assert_allclose(projection_jacobian(B.P, X[None])[0], numeric, rtol=1e-6)
+
+
+@pytest.mark.parametrize('distortion', [None, Distortion('plumb_bob', K, np.array([0.3, -0.1, 0.001, 0.002, 0.0]), np.eye(3))])
+def test_a_cropped_view_counts_its_pixels_from_its_own_corner(distortion):
+    whole = make_view('b', Pb, 101, 81, distortion)
+    part = crop(whole, slice(20, 71), slice(10, 91))
+    assert (part.width, part.height) == (81, 51)
+    X = np.array([[0.0, 0.01, 0.02], [0.01, -0.01, -0.03]])
+    seen = distort(whole, project(whole.P, X))
+    assert_allclose(distort(part, project(part.P, X)), seen - [10, 20], atol=1e-9)
+    assert_allclose(undistort(part, seen - [10, 20]), project(part.P, X), atol=1e-4)
 
 
 def test_decompose_gives_back_k_and_pose():

@@ -12,7 +12,7 @@ from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
 from fluoro_shape_ros.strips import (
-    WIDTHS, Measurement, Strips, apparent_width, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
+    WIDTHS, Measurement, Model, Strips, apparent_width, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -51,7 +51,7 @@ def strips_of(direction, image=None, field=FIELD, view=VIEW, reach=REACH, **draw
 
 
 def measured(strips, on=None):
-    return only(measure(strips, shadow(HALF_WIDTH, strips.offsets_px)[None], on))
+    return only(measure(strips, Model.of(shadow(HALF_WIDTH, strips.offsets_px)[None], strips.offsets_px), on))
 
 
 def searched(strips):
