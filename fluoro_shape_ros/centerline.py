@@ -7,7 +7,8 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+
+from .curve import middle
 
 RIDGE_Z = 3.5           # ridge points stand out from the noise by this many standard deviations
 MAX_RIDGE_SHARE = 0.015 # of the pixels, at most: the strongest
@@ -76,7 +77,7 @@ def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> 
     some = inside.ravel()[::stride] > 0
     if not some.any():
         return _no_ridges()
-    noise = _noise_ratio(sigma) * 1.4826 * float(np.median(np.abs(uv.ravel()[::stride][some]))) + 1e-12    # of 2 l2
+    noise = _noise_ratio(sigma) * 1.4826 * float(middle(np.abs(uv.ravel()[::stride][some]))) + 1e-12    # of 2 l2
     sample = l2.ravel()[::stride][some]
     enough = int((1 - min(max(shrink * MAX_RIDGE_SHARE, FEW_RIDGES / (shrink * image.size)), 0.9)) * len(sample))
     faintest = FAINTEST * max(cv2.norm(l2, cv2.NORM_INF), float(smooth.max()) * 1e-3)           # without noise, rounding is no ridge
@@ -107,28 +108,31 @@ def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> 
     far = np.abs(t[keep])
     beside = at[keep] + np.where(t[keep] > 0, 1, -1) * (np.rint(nv[keep]).astype(int) * w + np.rint(nu[keep]).astype(int))
     rival = index[beside]
-    keep = keep[(rival < 0) | (far < far[rival]) | ((far == far[rival]) & (at[keep] < beside))]
-    u, v = u[keep], v[keep]
-    return _branches(u, v, u + du[keep], v + dv[keep], 2 * strength[keep] / noise, image.shape, max(KINK_PX // shrink, 3))
+    gone = (rival >= 0) & ((far > far[rival]) | ((far == far[rival]) & (at[keep] > beside)))
+    index[at[keep[gone]]] = -1
+    keep = keep[~gone]
+    index[at[keep]] = np.arange(len(keep))
+    points = np.stack([u[keep] + du[keep], v[keep] + dv[keep]], axis=1)
+    return _branches(points, 2 * strength[keep] / noise, _neighbour_pairs(at[keep], index, w), max(KINK_PX // shrink, 3))
 
 
 def _no_ridges() -> Ridges:
     return Ridges(np.empty((0, 2)), np.empty(0), np.zeros(1, int))
 
 
-def _branches(u, v, su, sv, z, shape, kink: int) -> Ridges:
-    """Cut the ridge pixels at junctions and sort them along their branches; where one turns sharply within `kink` points, two lines touch."""
-    pairs = _neighbour_pairs(u, v, shape)
-    alive = np.bincount(pairs.ravel(), minlength=len(u)) <= 2
+def _branches(points: np.ndarray, z: np.ndarray, pairs: np.ndarray, kink: int) -> Ridges:
+    """Cut the (M, 2) ridge points, (E, 2) of which are neighbours, at junctions and sort them along their branches; where one turns sharply within
+    `kink` points, two lines touch."""
+    alive = np.bincount(pairs.ravel(), minlength=len(z)) <= 2
     pairs = pairs[alive[pairs].all(axis=1)]
-    label, place, rings = _walk(pairs, len(u))
+    label, place, rings = _walk(pairs, len(z))
     if rings.any():     # a ring has no end to start from: open it at its first pixel
-        opened = _walk(pairs[(label[pairs[:, 0]] < 0) & ~rings[pairs].any(axis=1)], len(u))
+        opened = _walk(pairs[(label[pairs[:, 0]] < 0) & ~rings[pairs].any(axis=1)], len(z))
         label, place = np.maximum(label, opened[0]), np.maximum(place, opened[1])
     order = np.lexsort((place, label))[np.count_nonzero(label < 0):]
     if not len(order):
         return _no_ridges()
-    return _split_at_kinks(np.c_[su, sv][order], z[order], label[order], kink)
+    return _split_at_kinks(points[order], z[order], label[order], kink)
 
 
 def _walk(pairs: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -164,31 +168,33 @@ def _walk(pairs: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 def _split_at_kinks(points: np.ndarray, z: np.ndarray, label: np.ndarray, k: int) -> Ridges:
     """Branches of (M, 2) points sorted by their (M,) label, cut where one turns by MAX_KINK within `k` points."""
-    sharp = np.zeros(len(label), np.uint8)
+    sharp = np.zeros(len(label), bool)
     if len(label) > 2 * k:
-        before, after = points[k:-k] - points[:-2 * k], points[2 * k:] - points[k:-k]
-        cosine = (before * after).sum(axis=1) / np.sqrt((before**2).sum(axis=1) * (after**2).sum(axis=1) + 1e-18)
-        sharp[k:-k] = (label[:-2 * k] == label[2 * k:]) & (cosine < np.cos(MAX_KINK))
-    sharp = maximum_filter1d(sharp, 3) > 0
-    cut = np.diff(label, prepend=label[0]) != 0
-    cut |= np.diff(sharp.astype(np.int8), prepend=0) != 0
+        step = points[k:] - points[:-k]
+        square = np.einsum('ij,ij->i', step, step)
+        cosine = np.einsum('ij,ij->i', step[:-k], step[k:]) / np.sqrt(square[:-k] * square[k:] + 1e-18)
+        turn = (label[:-2 * k] == label[2 * k:]) & (cosine < np.cos(MAX_KINK))
+        sharp[k:-k] = turn
+        sharp[k - 1:-k - 1] |= turn
+        sharp[k + 1:len(label) - k + 1] |= turn
+    cut = np.zeros(len(label), bool)
+    cut[1:] = (label[1:] != label[:-1]) | (sharp[1:] != sharp[:-1])
     piece, keep = np.cumsum(cut), ~sharp
     points, z, piece = points[keep], z[keep], piece[keep]
     changes = np.nonzero(np.diff(piece))[0] + 1
     return Ridges(points, z, np.concatenate([[0], changes, [len(z)]]).astype(int))
 
 
-def _neighbour_pairs(u: np.ndarray, v: np.ndarray, shape) -> np.ndarray:
-    """(E, 2) indices of 8-neighbours among the pixels; a diagonal only where no 4-neighbour path joins the two."""
-    w = shape[1] + 2
-    index = np.full(w * (shape[0] + 2), -1, np.int32)
-    at = (v + 1) * w + u + 1
-    here = np.arange(len(u), dtype=np.int32)
-    index[at] = here
-    right, down = index[at + 1], index[at + w]
-    pairs = [np.c_[here, right][right >= 0], np.c_[here, down][down >= 0]]
-    for step, corner_1, corner_2 in ((w + 1, 1, w), (w - 1, -1, w)):
+def _neighbour_pairs(at: np.ndarray, index: np.ndarray, w: int) -> np.ndarray:
+    """(E, 2) 8-neighbours among pixels; a diagonal only where no 4-neighbour path joins the two.
+
+    at: (M,) places in the raveled image, not at its border. index: (H * W,) which pixel is there, -1 for none. w: the image's width.
+    """
+    here = np.arange(len(at), dtype=index.dtype)
+    right, left, down = index[at + 1] >= 0, index[at - 1] >= 0, index[at + w] >= 0
+    pairs = []
+    for step, ok in ((1, right), (w, down), (w + 1, ~(right | down)), (w - 1, ~(left | down))):
         other = index[at + step]
-        ok = (other >= 0) & (index[at + corner_1] < 0) & (index[at + corner_2] < 0)
-        pairs.append(np.c_[here, other][ok])
+        ok = ok & (other >= 0)
+        pairs.append(np.stack([here[ok], other[ok]], axis=1))
     return np.concatenate(pairs)

@@ -25,7 +25,8 @@ def first_curve(views, a_px: np.ndarray, b_px: np.ndarray, alignment: Alignment)
     common /= common[-1]
     n = int(np.clip(np.hypot(along_a[-1] - along_a[0], along_b[-1] - along_b[0]) / 25, 6, 30))
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, n - 2), np.ones(3)])
-    distance = [abs(depth(v.P, isocenter(views)[None])[0]) for v in views]
+    center = isocenter(views)[None]
+    distance = [abs(depth(v.P, center)[0]) for v in views]
     rows, right = [], []
     for view, line, along, d in zip(views, (a_px, b_px), (along_a, along_b), distance):
         s = arc_length(line)

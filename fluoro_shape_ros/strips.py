@@ -18,6 +18,7 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips
+SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
 WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
 WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
@@ -78,13 +79,18 @@ def cut(images, fields, views, points: np.ndarray, tangents: np.ndarray, reach_p
 
 def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], reach_px: float) -> tuple[Strips, np.ndarray]:
     """Strips across (N, 2) lines of image pixels about a pixel apart, at every third; and of which line each strip is."""
-    smooth = [uniform_filter1d(line, 9, axis=0, mode='nearest') for line in lines_px]
-    tangent = np.concatenate([np.gradient(line, axis=0)[::3] for line in smooth])
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
-    centers, normals = np.concatenate([line[::3] for line in smooth]), np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    lengths = np.array([len(line) for line in lines_px])
+    last = np.cumsum(lengths) - 1
+    at, of = (np.concatenate(x) for x in zip(*((np.arange(stop - n + 1, stop + 1, 3), np.full(-(-n // 3), k)) for k, (n, stop) in enumerate(zip(lengths, last)))))
+    points = np.concatenate(lines_px)
+    total = np.concatenate([np.zeros((1, 2)), np.cumsum(points, axis=0)])
+    low, high = np.maximum(at - SMOOTHED, (last - lengths + 1)[of]), np.minimum(at + SMOOTHED, last[of])
+    centers = (total[high + 1] - total[low]) / (high + 1 - low)[:, None]
+    along = (total[high + 1] - total[at]) / (high + 1 - at)[:, None] - (total[at + 1] - total[low]) / (at + 1 - low)[:, None]     # from the mean behind to that ahead
+    normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / (np.hypot(along[:, 0], along[:, 1]) + 1e-9)[:, None]
     offsets = np.arange(-reach_px, reach_px + 1)
     profiles, inside, lit = _sample(image, field, None, centers, normals, offsets)
-    return Strips(centers, normals, np.ones(len(centers)), profiles, offsets, inside, lit), np.repeat(np.arange(len(smooth)), [len(x[::3]) for x in smooth])
+    return Strips(centers, normals, np.ones(len(centers)), profiles, offsets, inside, lit), of
 
 
 def _sample(image, field, view: View | None, centers, normals, offsets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
