@@ -22,16 +22,16 @@ DISAGREE_PX = 0.9       # what the planes' ends may differ by, beside noise
 FLOOR_PX = 0.12         # what the model of the edge itself is worth
 
 
-def supported(presence: np.ndarray) -> tuple[int, int] | None:
-    """First and last index of the device's stretch of (N, 2) presence (NaN: outside the field), steps of about a pixel; None where there is none."""
-    smooth = cv2.blur(np.nan_to_num(presence.clip(-1, 2)).astype(np.float32), (1, SMOOTH_PX), borderType=cv2.BORDER_REPLICATE)
+def supported(presence: np.ndarray, step_px: int = 1) -> tuple[int, int] | None:
+    """First and last index of the device's stretch of (N, 2) presence (NaN: outside the field), about `step_px` apart; None where there is none."""
+    smooth = cv2.blur(np.nan_to_num(presence.clip(-1, 2)).astype(np.float32), (1, SMOOTH_PX // step_px), borderType=cv2.BORDER_REPLICATE)
     both, either = (smooth > PRESENT).all(axis=1), (smooth > PRESENT).any(axis=1)
     at = np.nonzero(both)[0]
     if len(at) < 5:
         return None
-    gaps = np.nonzero(np.diff(at) > GAP_PX)[0]
+    gaps = np.nonzero(np.diff(at) * step_px > GAP_PX)[0]
     # a gap is bridged when it is short, or when one plane shows the device nearly all the way
-    cut = [g for g in gaps if not (at[g + 1] - at[g] <= BRIDGED_PX and either[at[g]:at[g + 1]].mean() > 0.8)]
+    cut = [g for g in gaps if not ((at[g + 1] - at[g]) * step_px <= BRIDGED_PX and either[at[g]:at[g + 1]].mean() > 0.8)]
     starts, stops = [0, *(g + 1 for g in cut)], [*cut, len(at) - 1]
     best = np.argmax([both[at[i]:at[j] + 1].sum() for i, j in zip(starts, stops)])
     return int(at[starts[best]]), int(at[stops[best]])

@@ -84,7 +84,11 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
             spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within).spline
         for _ in range(MEDIUM):
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
-            spline = solve(layout, spline, strips, measure(strips, cylinder, within), views, within).spline
+            seen = measure(strips, cylinder, within)
+            spline = solve(layout, spline, strips, seen, views, within).spline
+        stretch = supported(seen.presence.T, COARSE_STEP)
+        if stretch is not None:
+            reference = (layout.s[stretch[0]], layout.s[stretch[1]])
         layout = Layout.of(spline, step)
         s = layout.s
         for _ in range(fine):

@@ -40,6 +40,7 @@ class Layout:
     unknowns: np.ndarray    # (n - 3, BAND) index of those that a piece touches
     band: np.ndarray        # (n - 3, BAND, BAND) where each term of a piece's equations stands in the lower band; past its end for those above the diagonal
     stiffness: np.ndarray   # (n, n) 1/m^2: a device bends evenly (third differences of the control points)
+    prior: np.ndarray       # (BAND, 3 n) 1/m^2, lower band: that, and no step slides it along itself
 
     @classmethod
     def of(cls, spline: Spline3, step: float) -> Layout:
@@ -52,17 +53,27 @@ class Layout:
         local, first = np.arange(BAND), 3 * np.arange(n - 3)[:, None, None]
         below = local[:, None] - local
         band = np.where(below < 0, BAND * 3 * n, below * 3 * n + first + local)
+        at, unknowns = np.where(there, starts[:, None] + place, 0), first[:, 0] + local
         D = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
-        return cls(s, spline.basis(s), spline.basis(s, 1), b, np.where(there, starts[:, None] + place, 0), there, first[:, 0] + local, band, D.T @ D)
+        stiffness, slope = D.T @ D, spline.basis(s, 1)
+        along = (b[:, :, None] * (slope @ spline.control)[:, None, :]).reshape(-1, BAND)[at[:, ::4]] * (there[:, ::4, None] / SLIDE)
+        prior = _sum(band, along.transpose(0, 2, 1) @ along, 3 * n)
+        prior[0] += FLOOR
+        for k in range(4):
+            prior[3 * k, :3 * (n - k)] += np.repeat(np.diagonal(stiffness, k), 3)
+        return cls(s, spline.basis(s), slope, b, at, there, unknowns, band, stiffness, prior)
 
     def matrix(self, blocks: np.ndarray) -> np.ndarray:
         """(BAND, 3 n) lower band of the sum of the (n - 3, BAND, BAND) overlapping blocks of the pieces."""
-        size = 3 * len(self.stiffness)
-        return np.bincount(self.band.ravel(), blocks.ravel(), BAND * size + 1)[:-1].reshape(BAND, size)
+        return _sum(self.band, blocks, 3 * len(self.stiffness))
 
     def vector(self, parts: np.ndarray) -> np.ndarray:
         """(3 n,) sum of the (n - 3, BAND) overlapping parts."""
         return np.bincount(self.unknowns.ravel(), parts.ravel())
+
+
+def _sum(band: np.ndarray, blocks: np.ndarray, size: int) -> np.ndarray:
+    return np.bincount(band.ravel(), blocks.ravel(), BAND * size + 1)[:-1].reshape(BAND, size)
 
 
 @dataclass(frozen=True)
@@ -128,7 +139,7 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
     tabled = lambda x: x[:, at].transpose(1, 0, 2).reshape(n - 3, -1)     # noqa: E731
     d = tabled(seen.offset_px)
     w0 = tabled(within / (REDUNDANCY * seen.variance + MODEL_PX**2)) * np.concatenate([layout.there] * 2, axis=1)
-    prior, pull = _prior(layout, spline)
+    prior, pull = layout.prior, -(layout.stiffness @ spline.control).ravel()
     for end in ends:
         prior, pull = prior + end.band(), pull + end.row * (end.target / end.variance)
     w, root, used = w0, np.sqrt(w0), w0 > 0
@@ -149,17 +160,6 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
     information = layout.matrix((columns * (w / together)[:, None]) @ rows) + prior
     after = Spline3(spline.start, spline.stop, spline.control + step.reshape(n, 3))
     return Solution(after, information, offset, float(np.abs(moved[used]).max(initial=0.0)))
-
-
-def _prior(layout: Layout, spline: Spline3) -> tuple[np.ndarray, np.ndarray]:
-    """(BAND, 3 n) and (3 n,): a device bends evenly, and no step slides it along itself."""
-    tangents = layout.slope @ spline.control
-    slide = (layout.weights[:, :, None] * tangents[:, None, :]).reshape(-1, BAND)[layout.at[:, ::4]] * (layout.there[:, ::4, None] / SLIDE)
-    band = layout.matrix(slide.transpose(0, 2, 1) @ slide)
-    band[0] += FLOOR
-    for k in range(4):
-        band[3 * k, :band.shape[1] - 3 * k] += np.repeat(np.diagonal(layout.stiffness, k), 3)
-    return band, -(layout.stiffness @ spline.control).ravel()
 
 
 def _together(z: np.ndarray) -> float:
