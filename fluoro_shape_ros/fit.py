@@ -18,10 +18,10 @@ from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
 from .strips import Measurement, Model, Strips, apparent_width, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
 
-COARSE, MEDIUM, FINE = 2, 2, 3
+COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 COARSE_STEP = 3         # px between the strips of a coarse round
-SETTLED_PX = 0.2       # a fine round that moves the curve less is the last
+SETTLED_PX = 0.05       # a fine round that moves the curve less is the last
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
 NEAR_END_PX = 8
