@@ -16,7 +16,7 @@ from .extent import End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import Measurement, Model, Strips, apparent_width, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
+from .strips import Measurement, Model, Strips, apparent_width, background, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
 
 COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
@@ -69,8 +69,9 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
     if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
         return None     # it goes to a source
     reach = half_width_range(max(half_width))
-    template = _shadows(half_width, np.arange(-reach, reach + 1))
-    cylinder = Model.of(template, np.arange(-reach, reach + 1))
+    offsets = np.arange(-reach, reach + 1)
+    template = _shadows(half_width, offsets)
+    cylinder, beside = Model.of(template, offsets), [background(t, offsets) for t in template]
     spline = through(points, EXTENSION_PX * step)
     reference = (0.0, arc_length(points)[-1])
     grown, length_px, fine = 0, 0.0, FINE
@@ -94,7 +95,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         for _ in range(fine):
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
             within = (s >= reference[0]) & (s <= reference[1])
-            own = np.stack([own_shadow(p, strips.offsets_px, within & i, e) for p, i, e in zip(strips.profiles, strips.inside, template)])
+            own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, beside, strips.inside, template)])
             model = Model.of(own, strips.offsets_px)
             seen = measure(strips, model, within)
             solution = solve(layout, spline, strips, seen, views, within)
@@ -126,7 +127,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
 
 def _look(images, fields, views, reach_px: float, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
     """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
-    strips = cut(images, fields, views, f.spline(s.ravel()), f.spline(s.ravel(), 1), reach_px)
+    strips = cut(images, fields, views, *f.spline.lines(s.ravel()), reach_px)
     if s.ndim == 2:
         strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
     return strips, measure(strips, model, within)
@@ -234,7 +235,7 @@ def _aside(images, fields, views, f: Fit, half_width) -> np.ndarray:
     """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B; 0 where it leaves the field."""
     reach, px = half_width_range(max(half_width)), np.arange(-80, 20)
     s = (np.array([f.start, f.stop])[:, None] + OUTWARD[:, None] * px * (f.s[1] - f.s[0])).ravel()
-    strips = cut(images, fields, views, f.spline(s), f.spline(s, 1), reach + WIDE_PX).halves()
+    strips = cut(images, fields, views, *f.spline.lines(s), reach + WIDE_PX).halves()
     line = search(strips, _shadows(half_width, np.arange(-reach, reach + 1)).repeat(2, axis=0))
     dark = middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
     return np.where(f.open_end[:, None], 0.0, dark)

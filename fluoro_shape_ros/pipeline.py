@@ -122,7 +122,8 @@ def backbone(f: Fit, forward: bool, step: float) -> Shape:
     along = arc_length(f.spline(u))
     s = even_steps(along[-1], step)
     at = np.interp(s, along, u)
-    points, basis = f.spline(at), f.spline.basis(at)
+    basis, = f.spline.bases(at, 0)
+    points = basis @ f.spline.control
     n = len(f.spline.control)
     half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
     covariance = np.einsum('iamb,im->iab', half, basis)

@@ -18,7 +18,7 @@ SLIDE = 1e-4            # m: images do not see a curve slide along itself, so no
 MODEL_PX = 0.15         # what the model of a strip is worth (0.03 px, the same over some 25 strips), added to the noise
 BLOCK = 16              # strips over which errors that go together (anatomy, crossings) show
 REDUNDANCY = 1.3        # cubic interpolation correlates neighbouring strips
-REWEIGHTED = 3          # times
+REWEIGHTED = 2          # times
 BAND = 12               # unknowns that one strip sees: three of each of four control points
 FLOOR = 1.0             # 1/m^2: no unknown is known less well than to a metre, so that there always is a solution
 
@@ -45,8 +45,8 @@ class Layout:
     @classmethod
     def of(cls, spline: Spline3, step: float) -> Layout:
         s, n = np.arange(spline.start, spline.stop, step), len(spline.control)
-        k, b = spline.weights(s)
-        starts = np.searchsorted(k, np.arange(n - 3))
+        k, b = spline.weights(s, 0)
+        starts = np.searchsorted(k[:, 0], np.arange(n - 3))
         counts = np.diff(np.append(starts, len(k)))
         place = np.arange(counts.max())
         there = place < counts[:, None]
@@ -55,13 +55,13 @@ class Layout:
         band = np.where(below < 0, BAND * 3 * n, below * 3 * n + first + local)
         at, unknowns = np.where(there, starts[:, None] + place, 0), first[:, 0] + local
         D = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
-        stiffness, slope = D.T @ D, spline.basis(s, 1)
+        stiffness, (basis, slope) = D.T @ D, spline.bases(s, 0, 1)
         along = (b[:, :, None] * (slope @ spline.control)[:, None, :]).reshape(-1, BAND)[at[:, ::4]] * (there[:, ::4, None] / SLIDE)
         prior = _sum(band, along.transpose(0, 2, 1) @ along, 3 * n)
         prior[0] += FLOOR
         for k in range(4):
             prior[3 * k, :3 * (n - k)] += np.repeat(np.diagonal(stiffness, k), 3)
-        return cls(s, spline.basis(s), slope, b, at, there, unknowns, band, stiffness, prior)
+        return cls(s, basis, slope, b, at, there, unknowns, band, stiffness, prior)
 
     def matrix(self, blocks: np.ndarray) -> np.ndarray:
         """(BAND, 3 n) lower band of the sum of the (n - 3, BAND, BAND) overlapping blocks of the pieces."""
@@ -112,13 +112,14 @@ class EndRow:
         (t_a J_a / |J_a X'| - t_b J_b / |J_b X'|) dX = s_a - s_b.
         """
         s = np.array([at])
-        X, T = spline(s)[0], spline(s, 1)[0]
+        (basis,), (slope,) = spline.bases(s, 0, 1)
+        X, T = basis @ spline.control, slope @ spline.control
         steps = []
         for v in views:
             J = projection_jacobian(v.P, X)
             step = J @ T
             steps.append(step @ J / max(step @ step, 1e-9))
-        row = (spline.basis(s)[0][:, None] * (steps[0] - steps[1])).ravel()
+        row = (basis[:, None] * (steps[0] - steps[1])).ravel()
         return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
 
 
@@ -142,15 +143,15 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
     prior, pull = layout.prior, -(layout.stiffness @ spline.control).ravel()
     for end in ends:
         prior, pull = prior + end.band(), pull + end.row * (end.target / end.variance)
-    w, root, used = w0, np.sqrt(w0), w0 > 0
+    r, root, used = d, np.sqrt(w0), w0 > 0
     for _ in range(REWEIGHTED):
+        z = r * root
+        spread = max(1.0, 1.4826 * float(middle(np.abs(z[used])))) if used.any() else 1.0
+        w = w0 * np.maximum(1 - (z / (5 * spread)) ** 2, 0) ** 2 / spread**2
         normal = layout.matrix((columns * w[:, None]) @ rows) + prior
         step = dpbsv(normal, layout.vector((columns @ (w * d)[..., None])[..., 0]) + pull, lower=1)[1]
         moved = (rows @ step[layout.unknowns][..., None])[..., 0]
         r = d - moved
-        z = r * root
-        spread = max(1.0, 1.4826 * float(middle(np.abs(z[used])))) if used.any() else 1.0
-        w = w0 * np.maximum(1 - (z / (5 * spread)) ** 2, 0) ** 2 / spread**2
     plane = [slice(0, at.shape[1]), slice(at.shape[1], None)]      # of the table's columns
     together = np.empty_like(w)
     offset = np.full((2, len(layout.s)), np.nan)

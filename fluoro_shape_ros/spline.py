@@ -22,8 +22,8 @@ class Spline3:
     stop: float
     control: np.ndarray     # (n, 3) m
 
-    def weights(self, s: np.ndarray, derivative: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) index of the first of the four control points that count at each arc length, and (N, 4) their weights (de Boor 1978, uniform cubic).
+    def weights(self, s: np.ndarray, *derivatives: int) -> tuple[np.ndarray, ...]:
+        """(N, 4) index of the control points that count at each arc length, and for each of `derivatives` (N, 4) their weights (de Boor 1978, uniform cubic).
 
         Knots are uniform, so that equal control point steps are equal speed right to the ends. Beyond them the outermost pieces go on.
         """
@@ -31,20 +31,28 @@ class Spline3:
         h = (self.stop - self.start) / pieces
         x = (np.asarray(s, float) - self.start) / h
         k = x.astype(int).clip(0, pieces - 1)
+        powers = np.empty((len(x), 4))
         u = x - k
-        u2 = u * u
-        return k, np.stack([np.ones_like(u), u, u2, u2 * u], axis=1) @ (DERIVATIVES[derivative] / h**derivative)
+        powers[:, 0], powers[:, 1], powers[:, 2], powers[:, 3] = 1, u, u * u, u * u * u
+        return k[:, None] + np.arange(4), *(powers @ (DERIVATIVES[d] / h**d) for d in derivatives)
 
-    def basis(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """(N, n) basis functions, or their derivatives, at (N,) arc lengths."""
-        k, b = self.weights(s, derivative)
-        B = np.zeros((len(k), len(self.control)))
-        B[np.arange(len(k))[:, None], k[:, None] + np.arange(4)] = b
-        return B
+    def bases(self, s: np.ndarray, *derivatives: int) -> list[np.ndarray]:
+        """For each of `derivatives` (N, n) basis functions, or their derivatives, at (N,) arc lengths."""
+        k, *weights = self.weights(s, *derivatives)
+        rows, found = np.arange(len(k))[:, None], []
+        for w in weights:
+            found.append(np.zeros((len(k), len(self.control))))
+            found[-1][rows, k] = w
+        return found
 
     def __call__(self, s: np.ndarray, derivative: int = 0) -> np.ndarray:
         """(N, 3) points, or derivatives."""
-        return self.basis(s, derivative) @ self.control
+        return self.bases(s, derivative)[0] @ self.control
+
+    def lines(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) points and (N, 3) tangents dX/ds."""
+        points, tangents = self.bases(s, 0, 1)
+        return points @ self.control, tangents @ self.control
 
 
 def bending(n: int) -> np.ndarray:
@@ -59,7 +67,7 @@ def through(points: np.ndarray, extension: float, smoothing: float = 1e-3) -> Sp
     points = at_arc_length(points, s)
     start, stop = -extension, length + extension
     n = int(np.clip(np.ceil((stop - start) / KNOT_SPACING) + 3, MIN_CONTROL, MAX_CONTROL))
-    B = Spline3(start, stop, np.zeros((n, 3))).basis(s)
+    B = Spline3(start, stop, np.zeros((n, 3))).bases(s, 0)[0]
     D = bending(n)
     H = B.T @ B + smoothing * len(s) / n * D.T @ D
     return Spline3(start, stop, np.linalg.solve(H, B.T @ points))

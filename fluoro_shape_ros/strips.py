@@ -18,6 +18,7 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips
+OUTER = 0.02            # of a shadow: what is fainter lies beside the device
 SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
 WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
@@ -95,10 +96,10 @@ def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], 
 
 def _sample(image, field, view: View | None, centers, normals, offsets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, W) values, (N,) whether the whole strip lies in the field and (N,) whether its middle does."""
-    u, v = (c[:, None] + n[:, None] * offsets for c, n in zip(centers.T, normals.T))
+    offsets = offsets.astype(np.float32)
+    u, v = (c[:, None] + n[:, None] * offsets for c, n in zip(centers.T.astype(np.float32), normals.T.astype(np.float32)))
     if view is not None and view.distortion is not None:
-        u, v = distort(view, np.stack([u, v], axis=2).reshape(-1, 2)).T.reshape(2, *u.shape)
-    u, v = u.astype(np.float32), v.astype(np.float32)
+        u, v = distort(view, np.stack([u, v], axis=2).reshape(-1, 2)).T.reshape(2, *u.shape).astype(np.float32)
     profiles = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     ends = [0, len(offsets) // 2, -1]
     exposed = cv2.remap(field, u[:, ends], v[:, ends], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
@@ -173,22 +174,26 @@ def _shadow(half_width_cpx: int) -> tuple[np.ndarray, np.ndarray]:
     return x, blurred / blurred.max()
 
 
-def own_shadow(profiles: np.ndarray, offsets_px: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(W,) the device's mean over the `good` ones of (N, W) profiles, made symmetric, unit depth; the `expected` one where there is too little of it."""
+def own_shadow(profiles: np.ndarray, beside: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """(W,) the device's mean over the `good` ones of (N, W) profiles, made symmetric, unit depth; the `expected` one where there is too little of it.
+
+    beside: see `background`.
+    """
     if good.sum() < 20:
         return expected
     mean = middle(profiles[good][::2], axis=0)
-    outer = expected < 0.02
-    dark = _line(offsets_px, mean, outer) - mean if outer.sum() > 3 else mean.max() - mean
-    dark = 0.5 * (dark + dark[::-1])
-    dark[outer] = 0
-    return dark / dark.max() if dark.max() > 0 and expected @ dark > 0.7 * np.linalg.norm(expected) * np.linalg.norm(dark) else expected
+    dark = beside @ mean - mean
+    dark = np.where(expected < OUTER, 0.0, 0.5 * (dark + dark[::-1]))
+    return dark / dark.max() if dark.max() > 0 and expected @ dark > 0.7 * np.sqrt((expected @ expected) * (dark @ dark)) else expected
 
 
-def _line(x: np.ndarray, y: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """The straight line through the (x, y) `where`, at all x."""
-    dx, dy = x - x[where].mean(), y - y[where].mean()
-    return y[where].mean() + (dx[where] @ dy[where]) / (dx[where] @ dx[where]) * dx
+def background(expected: np.ndarray, offsets_px: np.ndarray) -> np.ndarray:
+    """(W, W) what gives of a profile the straight line through what is beside a device of the (W,) `expected` shadow."""
+    line = np.vander(offsets_px / offsets_px[-1], 2)
+    outer = np.nonzero(expected < OUTER)[0]
+    beside = np.zeros((len(line), len(line)))
+    beside[:, outer] = line @ np.linalg.pinv(line[outer])
+    return beside
 
 
 @dataclass(frozen=True)
@@ -238,7 +243,8 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     odd = np.einsum('vnw->vn', np.minimum(square, limit[..., None])) > 3.5 * width * noise**2   # another edge runs through: not to be trusted
     variance[~inside | odd | np.isnan(variance)] = np.inf
     sigma = np.array([n * g / middle(u) if np.isfinite(u[0]) else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
-    return Measurement(np.nan_to_num(offset), variance, darkness / usual, sigma)
+    offset[np.isnan(offset)] = 0.0
+    return Measurement(offset, variance, darkness / usual, sigma)
 
 
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:

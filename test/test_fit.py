@@ -129,7 +129,7 @@ def across(f, u):
 
 def lateral(f, u, N):
     """(K, 2, 2) m^2: covariance of the curve's points along the (K, 2, 3) vectors."""
-    B, n = f.spline.basis(u), len(f.spline.control)
+    B, n = f.spline.bases(u, 0)[0], len(f.spline.control)
     return N @ np.einsum('in,namb,im->iab', B, f.covariance.reshape(n, 3, n, 3), B) @ N.transpose(0, 2, 1)
 
 

@@ -12,7 +12,8 @@ from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
 from fluoro_shape_ros.strips import (
-    WIDTHS, Measurement, Model, Strips, apparent_width, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
+    WIDTHS, Measurement, Model, Strips, apparent_width, background, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow,
+    pieces, search, shadow)
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -187,13 +188,14 @@ def test_a_bright_line_is_the_opposite_and_an_edge_is_unlike():
 def test_the_devices_own_shadow_replaces_the_expected_one_where_there_is_enough_of_it():
     strips = strips_of((1, 0, 0), half_width=2.5, noise=0.5)
     expected = shadow(HALF_WIDTH, strips.offsets_px)
-    own = own_shadow(strips.profiles[0], strips.offsets_px, ALL, expected)
+    beside = background(expected, strips.offsets_px)
+    own = own_shadow(strips.profiles[0], beside, ALL, expected)
     assert_allclose(own, shadow(2.5, strips.offsets_px), atol=0.06)
     assert np.abs(own - expected).max() > 0.1
     assert_allclose(own, own[::-1], atol=1e-6)
-    assert_allclose(own_shadow(strips.profiles[0], strips.offsets_px, np.arange(len(S)) < 10, expected), expected)
+    assert_allclose(own_shadow(strips.profiles[0], beside, np.arange(len(S)) < 10, expected), expected)
     nothing = strips_of((1, 0, 0), depth=0.0, noise=0.5)
-    assert_allclose(own_shadow(nothing.profiles[0], nothing.offsets_px, ALL, expected), expected)
+    assert_allclose(own_shadow(nothing.profiles[0], beside, ALL, expected), expected)
 
 
 def test_strips_along_lines_of_pixels():
