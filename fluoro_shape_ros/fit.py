@@ -21,7 +21,7 @@ from .strips import Measurement, Model, Strips, apparent_width, background, cut,
 COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 COARSE_STEP = 3         # px between the strips of a coarse round
-SETTLED_PX = 0.05       # a fine round that moves the curve less is the last
+SETTLED_PX = 0.08       # a fine round that moves the curve less is the last
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
 NEAR_END_PX = 8

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .config import Config
-from .curve import curvature
+from .curve import curvature, middle
 from .data import Outcome
 from .detect import evidence
 from .fit import Fit, contrast_ratio, ends_shown, shown
@@ -38,12 +38,13 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
+    end_shown = ends_shown(f).min(axis=1)
     for k, name in enumerate(('first', 'last')):
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * (f.s[1] - f.s[0]))):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
         if not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE):
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
-        if ends_shown(f)[k].min() < MIN_END_SHOWN:
+        if end_shown[k] < MIN_END_SHOWN:
             return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
@@ -84,7 +85,7 @@ def check_length(length: float, config: Config) -> tuple[Outcome, str] | None:
 
 def check_reprojection(residuals_px: np.ndarray, config: Config) -> tuple[Outcome, str] | None:
     """Median of the (N, 2) residuals of each plane: None, or the rejection."""
-    worst = float(np.nanmedian(residuals_px, axis=0).max())
+    worst = max((float(middle(r[np.isfinite(r)])) for r in residuals_px.T if np.isfinite(r).any()), default=float('nan'))
     if worst > config.plausibility.max_reprojection_px:
         return Outcome.REPROJECTION, f'median reprojection residual {worst:.1f} px exceeds {config.plausibility.max_reprojection_px:g} px'
     return None
