@@ -157,6 +157,8 @@ def _walk(pairs: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     steps, lowest = np.where(last, 0, 1), np.minimum(tail, head)
     for _ in range(int(np.ceil(np.log2(count))) + 1):
         steps, lowest, after = steps + steps[after], np.minimum(lowest, lowest[after]), after[after]
+        if last[after].all():       # no rings: done when the longest line is
+            break
     ring = ~last[after]
     rings[lowest[ring]] = True
     end = head[after]

@@ -13,9 +13,8 @@ from .data import Outcome
 from .fit import Fit, contrast_ratio, fit, shown
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
-from .planes import both
 from .start import first_curve
-from .strips import apparent_width, cut_along, half_width_range, odd_width, pieces
+from .strips import apparent_width, cut_along, half_width_range, likeness, odd_width, pieces
 
 LINES = 14              # strongest lines of an image that are looked at closely
 CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...
@@ -45,7 +44,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     """Search both whole images (H, W float32, dark device) for the device of `radius` m."""
     center = isocenter(views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in views]
-    candidates = both(candidates_of, images, fields, widths, [min_length_px] * 2)
+    candidates = [candidates_of(*plane, min_length_px) for plane in zip(images, fields, widths)]
     best = tuple(c[0].points_px if c else None for c in candidates)
     for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if not found:
@@ -86,8 +85,9 @@ def candidates_of(image, field, half_width_px: float, min_length_px: float) -> l
     if not lines:
         return []
     strips, of = cut_along(image, field, [line.points_px for line in lines], half_width_range(half_width_px))
-    profiles = [pieces(strips.profiles, strips.inside & (of == k)) for k in range(len(lines))]
-    seen = [apparent_width([p], [half_width_px]) for p in profiles]
+    profiles, of = pieces(strips.profiles, strips.inside, of)
+    alike = likeness(profiles, half_width_px)
+    seen = [apparent_width([alike[of == k]]) for k in range(len(lines))]
     scored = [replace(line, score=alike_device(odd_width(width, half_width_px), alike)) for line, (width, alike) in zip(lines, seen)]
     scored.sort(key=lambda c: -c.score * np.sqrt(len(c.z)))
     return [c for c in scored[:CANDIDATES] if c.score > HOPELESS * scored[0].score]

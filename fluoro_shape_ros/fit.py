@@ -16,7 +16,8 @@ from .extent import End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import Measurement, Model, Strips, apparent_width, background, cut, half_width_range, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow
+from .strips import (
+    Measurement, Model, Strips, apparent_width, background, cut, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
 
 COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
@@ -166,7 +167,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
     contrast = np.array([_contrast(p) for p in profile])
     scale = np.array(half_width) / radius
     across = 1 - (1 - contrast) ** np.clip(middle(strips.speed[:, between]) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
-    width, alike = apparent_width([pieces(p, between & i) for p, i in zip(strips.profiles, strips.inside)], half_width)
+    width, alike = apparent_width([likeness(pieces(p, between & i)[0], h) for p, i, h in zip(strips.profiles, strips.inside, half_width)])
     opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line
     odd = 0.0 if opaque else odd_width(width, float(np.mean(half_width)))
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)

@@ -162,7 +162,7 @@ def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] =
 
 def _near(regions, look, images, fields, views, polarity: str, *known) -> Detection | None:
     """What `look` finds in these regions of both planes; None where it finds nothing, or something that may go on beyond them."""
-    cropped = both(stable_noise, images, [polarity] * 2, regions), [f[r] for f, r in zip(fields, regions)], [crop(v, *r) for v, r in zip(views, regions)]
+    cropped = [stable_noise(i, polarity, r) for i, r in zip(images, regions)], [f[r] for f, r in zip(fields, regions)], [crop(v, *r) for v, r in zip(views, regions)]
     found = look(*cropped, *known)
     if found is None:
         return None

@@ -1,4 +1,4 @@
-"""Both planes at once: NumPy and OpenCV let go of the interpreter while they work."""
+"""Both planes at once: worth it for work on whole images, during which NumPy and OpenCV let go of the interpreter."""
 
 from __future__ import annotations
 

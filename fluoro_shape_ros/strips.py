@@ -126,14 +126,14 @@ def _cylinders(half_width_cpx: int, count: int) -> tuple[np.ndarray, np.ndarray]
     return basis, shadows / np.linalg.norm(shadows, axis=1, keepdims=True)
 
 
-def apparent_width(profiles: list[np.ndarray], half_width_px) -> tuple[float, np.ndarray]:
+def apparent_width(alike: list[np.ndarray]) -> tuple[float, np.ndarray]:
     """How many times as wide as expected a device looks, the same in all V planes, and the (V,) likeness of each with a cylinder so wide.
 
-    profiles: (B, W) of its pieces in each plane. The median piece counts: some may run along another edge.
+    alike: (B, K) `likeness` of its pieces in each plane. The median piece counts: some may run along another edge.
     """
-    alike = np.stack([middle(likeness(p, h), axis=0) if len(p) else np.zeros(len(WIDTHS)) for p, h in zip(profiles, half_width_px)])
-    best = int(alike.min(axis=0).argmax())
-    return float(WIDTHS[best]), alike[:, best]
+    typical = np.stack([middle(a, axis=0) if len(a) else np.zeros(len(WIDTHS)) for a in alike])
+    best = int(typical.min(axis=0).argmax())
+    return float(WIDTHS[best]), typical[:, best]
 
 
 def odd_width(width: float, half_width_px: float) -> float:
@@ -145,12 +145,20 @@ def odd_width(width: float, half_width_px: float) -> float:
     return float(max(ratio - np.log1p(WIDER_PX / half_width_px), -ratio - np.log1p(NARROWER_PX / half_width_px), 0.0))
 
 
-def pieces(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """(B, W) medians of successive PIECE good ones among (N, W) profiles; one of all where there are fewer."""
-    profiles = profiles[good]
-    if len(profiles) < PIECE:
-        return middle(profiles, axis=0)[None] if len(profiles) else profiles
-    return middle(profiles[:len(profiles) // PIECE * PIECE].reshape(-1, PIECE, profiles.shape[1]), axis=1)
+def pieces(profiles: np.ndarray, good: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(B, W) medians of successive PIECE `good` ones among (N, W) profiles, and of which line each is; one of all where a line has fewer.
+
+    of: (N,) ascending, the line of each profile; all are of one by default.
+    """
+    at = np.nonzero(good)[0]
+    of = np.zeros(len(at), int) if of is None else of[at]
+    first = np.searchsorted(of, np.arange(of[-1] + 2 if len(of) else 1))
+    counts = np.diff(first)
+    number = np.maximum(counts // PIECE, counts > 0)
+    line = np.repeat(np.arange(len(counts)), number)
+    place = np.arange(len(line)) - np.repeat(np.cumsum(number) - number, number)
+    within = (PIECE * place[:, None] + np.arange(PIECE)) % np.maximum(counts[line], 1)[:, None]    # a short line goes round and round
+    return middle(profiles[at[first[line][:, None] + within]], axis=1), line
 
 
 def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:

@@ -208,11 +208,22 @@ def test_strips_along_lines_of_pixels():
     assert_allclose(measured(planes).offset_px * strips.normals[of == 1, 1], -0.15, atol=0.02)
 
 
+def test_pieces_are_medians_along_each_line_and_a_short_line_is_one():
+    along = np.r_[np.arange(70.0), np.arange(5.0), np.arange(40.0)][:, None] * np.ones(3)
+    of, good = np.repeat([0, 2, 3], [70, 5, 40]), np.ones(115, bool)        # nothing of line 1
+    good[75:84] = False
+    medians, line = pieces(along, good, of)
+    assert line.tolist() == [0, 0, 2, 3]
+    assert_allclose(medians[:, 0], [15, 46, 2, 24])
+    nothing, none = pieces(along, np.zeros(115, bool), of)
+    assert nothing.shape == (0, 3) and len(none) == 0
+
+
 def test_how_wide_a_line_looks_and_when_that_is_odd():
     for factor in (0.7, 1.0, 1.4):
         image = draw((1, 0, 0), half_width=factor * HALF_WIDTH, noise=0.5)
         strips = strips_of((1, 0, 0), image)
-        width, alike = apparent_width([pieces(strips.profiles[0], ALL)], [HALF_WIDTH])
+        width, alike = apparent_width([likeness(pieces(strips.profiles[0], ALL)[0], HALF_WIDTH)])
         assert width == pytest.approx(factor, rel=0.08) and alike[0] > 0.99
     assert odd_width(0.88, 2.0) == odd_width(1.0, 2.0) == odd_width(0.7, 2.0) == 0
     assert odd_width(1.5, 2.0) > odd_width(1.4, 2.0) > 0 and odd_width(0.4, 2.0) > 0
