@@ -156,7 +156,7 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     past = presence[at + 5:at + 22] if outward > 0 else presence[max(at - 21, 0):max(at - 4, 0)]
     if len(past) < 10:
         return np.where(np.isnan(past).any(axis=0), np.nan, 1.0)
-    return np.median(past, axis=0)
+    return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
 def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference, beyond, half_width, radius) -> tuple[Fit, list[End | None]]:

@@ -117,7 +117,7 @@ def isocenter(views: tuple[View, View]) -> np.ndarray:
         focal_px = np.sqrt(abs(np.linalg.det(views[0].P[:, :3])))
         return sources.mean(axis=0) + rays[0] * focal_px * baseline / (STEREO_SHIFT * views[0].width)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    return np.linalg.lstsq(across.sum(axis=0), np.einsum('vij,vj->i', across, sources), rcond=None)[0]
+    return np.linalg.solve(across.sum(axis=0), np.einsum('vij,vj->i', across, sources))
 
 
 def check_scale(views: tuple[View, View], radius: float) -> None:

@@ -167,5 +167,5 @@ def _together(z: np.ndarray) -> float:
     """By how much the mean of BLOCK successive normalised residuals varies more than independent ones would; at least 1."""
     if len(z) < 4 * BLOCK:
         return 1.0
-    blocks = z[:len(z) // BLOCK * BLOCK].reshape(-1, BLOCK)
-    return max(1.0, float((blocks.mean(axis=1) ** 2).mean() * BLOCK))
+    total = z[:len(z) // BLOCK * BLOCK].reshape(-1, BLOCK) @ np.ones(BLOCK)
+    return max(1.0, float(total @ total) / (BLOCK * len(total)))

@@ -30,7 +30,7 @@ class Spline3:
         pieces = len(self.control) - 3
         h = (self.stop - self.start) / pieces
         x = (np.asarray(s, float) - self.start) / h
-        k = x.astype(int).clip(0, pieces - 1)
+        k = np.minimum(np.maximum(x, 0).astype(int), pieces - 1)
         powers = np.empty((len(x), 4))
         u = x - k
         powers[:, 0], powers[:, 1], powers[:, 2], powers[:, 3] = 1, u, u * u, u * u * u

@@ -200,7 +200,7 @@ def background(expected: np.ndarray, offsets_px: np.ndarray) -> np.ndarray:
     line = np.vander(offsets_px / offsets_px[-1], 2)
     outer = np.nonzero(expected < OUTER)[0]
     beside = np.zeros((len(line), len(line)))
-    beside[:, outer] = line @ np.linalg.pinv(line[outer])
+    beside[:, outer] = line @ np.linalg.solve(line[outer].T @ line[outer], line[outer].T)
     return beside
 
 
@@ -282,5 +282,5 @@ def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np
     blocks = at[:len(at) // width * width].reshape(-1, width)
     medians = middle(values[blocks])
     overall = float(middle(medians))
-    medians = medians.clip(0.4 * overall, 2.5 * overall) if overall > 0 else medians
-    return np.interp(np.arange(len(values)), blocks.mean(axis=1), medians)
+    medians = np.minimum(np.maximum(medians, 0.4 * overall), 2.5 * overall) if overall > 0 else medians
+    return np.interp(np.arange(len(values)), blocks @ np.full(width, 1 / width), medians)
