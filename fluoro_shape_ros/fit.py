@@ -108,7 +108,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
             if solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, before)).max() < 2 * step:
                 break
         beyond = np.stack([_beyond(seen.presence.T, stretch[0], -1), _beyond(seen.presence.T, stretch[1], 1)])
-        goes_on = [bool((b > GOES_ON).all() or (b > GOES_ON_ALONE).any()) for b in beyond]
+        goes_on = [bool(not np.isnan(b).any() and ((b > GOES_ON).all() or (b > GOES_ON_ALONE).any())) for b in beyond]
         gained = (reference[1] - reference[0]) / step - length_px
         if not any(goes_on) or grown == GROWTH or (grown and gained <= NEAR_END_PX):
             break
