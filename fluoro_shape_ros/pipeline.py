@@ -21,7 +21,7 @@ from .geometry import GeometryError, check_pair, check_scale, crop, distort, pix
 from .mask import subtract
 from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
 from .planes import both
-from .prior import Guess, borne_out, judged, look
+from .prior import Guess, borne_out, informed, judged, look
 
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
@@ -64,6 +64,8 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
         return Reconstruction(found.outcome, found.detail, centerlines=seen, stage_seconds=clock.laps)
 
     f = found.fit
+    if guess is not None and borne_out(curve(f), guess):
+        f = informed(f, guess)
     ends = f.spline(np.array([f.start, f.stop]))
     known = _known_order(curve(f), prior, guess)
     forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, known)

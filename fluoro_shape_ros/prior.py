@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from .curve import arc_length, resample
 from .data import Prior, Reconstruction
+from .fit import Fit
 from .geometry import depth, project
 
 STEP = 1e-3             # m, between the points that are looked at
@@ -17,6 +18,7 @@ FLOOR = 1e-3            # m, standard deviation at the base: a robot's base is k
 FAR = 3.0               # standard deviations: what is farther off is another curve
 LENGTH_SHARE = 0.15     # by which the found length may differ from the predicted one, beside the tip's standard deviation
 SHORTEST, LONGEST = 0.005, 2.0      # m, of a prediction
+INDEPENDENT = 5         # points of a prediction whose errors have little to do with one another
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,25 @@ def doubt(points: np.ndarray, g: Guess) -> str:
     if distance[worst] > FAR * np.append(g.sigma[k], g.sigma[-1])[worst]:
         return f'the images show the {"tip" if worst == len(points) else "device"} {1000 * distance[worst]:.1f} mm from there'
     return ''
+
+
+def informed(f: Fit, g: Guess) -> Fit:
+    """The fit with what a guess that is borne out adds: a weak prior, so that it counts only where the images tell little.
+
+    The product of two Gaussians (Kalman's update) on the control points: across the curve at INDEPENDENT places along it, since a model's errors are the
+    same over long stretches, the guess's nearest points are observations with its standard deviations.
+    """
+    s = np.linspace(f.start, f.stop, INDEPENDENT)
+    points, tangents = f.spline.lines(s)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    _, k = cKDTree(g.points).query(points)
+    across = np.eye(3) - tangents[:, :, None] * tangents[:, None, :]
+    basis, = f.spline.bases(s, 0)
+    H = (across[:, :, None, :] * basis[:, None, :, None]).reshape(3 * len(s), -1)          # (3 INDEPENDENT, 3 n)
+    r = np.einsum('iab,ib->ia', across, g.points[k] - points).ravel()
+    gain = f.covariance @ H.T @ np.linalg.inv(H @ f.covariance @ H.T + np.diag(np.repeat(g.sigma[k] ** 2, 3)))
+    control = f.spline.control + (gain @ r).reshape(-1, 3)
+    return replace(f, spline=replace(f.spline, control=control), covariance=f.covariance - gain @ H @ f.covariance)
 
 
 def whole(length: float, g: Guess, views) -> bool:

@@ -10,10 +10,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from fluoro_shape_ros import prior
 from fluoro_shape_ros.config import Config, ConfigError
 from fluoro_shape_ros.data import Outcome, Prior
+from fluoro_shape_ros.fit import Fit
 from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.spline import Spline3
 from fluoro_shape_ros.tools import bench_prior
 from fluoro_shape_ros.tools.bench_prior import Try, predictions, pushed
 from fluoro_shape_ros.tools.trial import Answer
@@ -81,6 +83,22 @@ def test_a_prediction_of_either_direction_is_borne_out_by_its_curve():
     guess, _ = look(LINE)
     assert prior.borne_out(LINE, guess) and prior.borne_out(LINE[::-1], guess) and not prior.borne_out(LINE + [0, 0.02, 0], guess)
     assert prior.whole(0.1, guess, VIEWS) and not prior.whole(0.06, guess, VIEWS) and not prior.whole(0.14, guess, VIEWS)
+
+
+def test_in_a_fit_it_counts_by_its_standard_deviation_and_only_across_the_curve():
+    # along x; the images know z to 0.01 mm, but y, the same all along, only to 5 mm. Five independent points say y = 2 mm, z = 2 mm, each to 5 mm
+    n, mm = 9, 1e-3
+    control = np.c_[np.linspace(-0.05 - 0.1 / 6, 0.05 + 0.1 / 6, n), np.zeros((n, 2))]
+    covariance = np.zeros((n, 3, n, 3))
+    covariance[:, 1, :, 1] = (5 * mm) ** 2
+    covariance[np.arange(n), 2, np.arange(n), 2] = (0.01 * mm) ** 2
+    f = Fit(Spline3(0.0, 0.1, control), 0.0, 0.1, *[None] * 2, covariance.reshape(3 * n, 3 * n), *[None] * 10)
+    told = prior.informed(f, prior.Guess(LINE + [0.3 * mm, 2 * mm, 2 * mm], np.full(len(LINE), 5 * mm)))
+    points = told.spline(np.linspace(0, 0.1, 21))
+    assert_allclose(points[:, 0], np.linspace(-0.05, 0.05, 21), atol=1e-6)      # it does not slide along itself
+    assert_allclose(points[:, 1], 2 * mm * 5 / 6, atol=1e-6)                    # 5 / 25 of the points against 1 / 25 of the images
+    assert_allclose(points[:, 2], 0, atol=1e-6)
+    assert_allclose(np.sqrt(told.covariance.reshape(n, 3, n, 3)[4, 1, 4, 1]), 5 * mm / np.sqrt(6), rtol=1e-3)
 
 
 def test_a_pushed_tip_is_as_far_as_it_says():
