@@ -1,4 +1,4 @@
-"""From a predicted curve to the device near it: in strips across its projections, the darkest smooth path, and from both paths a curve in space.
+"""From a predicted curve to the device near it: in strips across its projections, the darkest smooth path, and one step of the fit's solver to both.
 
 The path in each plane is the most probable one (Viterbi 1967) where the response of each strip speaks for a shift and the prediction's standard
 deviation against it. Shifts in the two planes are the two directions across the curve, so each plane can be asked alone.
@@ -11,23 +11,24 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from .config import Config
-from .curve import resample
+from .curve import arc_length, middle
 from .detect import Detection, track
 from .fit import Fit
-from .geometry import distort, fundamental, pixels_per_metre, project, undistort
-from .matching import align
+from .geometry import pixels_per_metre
 from .plausibility import check_fit
-from .prior import Guess, borne_out, whole
-from .start import first_curve
-from .strips import shadow
+from .prior import Guess, borne_out, in_image, whole
+from .solver import Layout, solve
+from .spline import through
+from .strips import Measurement, Strips, lay_out, places, shadow
 
-STEP_PX, SHIFT_PX = 3.0, 1.5    # between strips, and along them: a path may turn by 27 degrees from the prediction
+STEP_PX = 2.0           # between strips; shifts are whole px, so a path may turn by 27 degrees from the prediction
 WITHIN = 2.0            # standard deviations to either side that a strip reaches
 BEYOND_PX = 30.0        # the path goes on straight past both ends: the device may be longer
 STRONGEST = 6.0         # noise deviations: a darker strip speaks no louder, it may be something else
-BEND_COST = 1.0         # of a shift that changes by a pixel from a strip to the next ...
-TRUST = 0.15            # ... and what the prediction counts in each strip: its error is the same in many
+BEND_COST = 0.7         # of a shift that changes by a pixel from a strip to the next ...
+TRUST = 0.1             # ... and what the prediction counts in each strip: its error is the same in many
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
+MOVES = np.array([0, -1, 1])
 SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
 SHARP = 0.35e-3         # m: an end less certain than this may be another one
@@ -66,56 +67,43 @@ def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | N
 
     images, fields: (H, W) float32 (dark device, even noise) and uint8, a pair each.
     """
-    paths = [_path(*plane, guess, radius) for plane in zip(images, fields, views)]
-    if any(path is None for path in paths):
+    scale = np.array([pixels_per_metre(v.P, guess.points) for v in views])
+    spline = through(guess.points, BEYOND_PX / scale.max())
+    layout = Layout.of(spline, STEP_PX / scale.max())
+    sigma_px = np.interp(layout.s, np.linspace(0, arc_length(guess.points)[-1], len(guess.sigma)), guess.sigma) * scale[:, None]     # (2, N)
+    reach = int(np.ceil(WITHIN * sigma_px.max()))
+    shifts = np.arange(-reach, reach + 1)
+    centers, normals, speed = lay_out(views, layout.basis @ spline.control, layout.slope @ spline.control)
+    strength = np.stack([_response(i, f, places(v, c, n, shifts), radius * k)
+                         for i, f, v, c, n, k in zip(images, fields, views, centers, normals, scale)])
+    away = shifts / sigma_px[..., None]
+    best = _most_probable(np.where(np.abs(away) > WITHIN, -np.inf, strength - TRUST * away**2 / 2))
+    gain = np.take_along_axis(strength, best[..., None], axis=2)[..., 0] - CLEAR
+    seen = np.zeros(gain.shape, bool)
+    for g, s, c, v in zip(gain, seen, centers, views):
+        start, stop = _darkest_stretch(g)
+        if stop - start < SHORTEST * in_image(v, c).sum() or (g[start:stop] > 0).mean() < SEEN:
+            return None
+        s[start:stop] = True
+    both = np.nonzero(seen.all(axis=0))[0]
+    if len(both) < SHORTEST * seen.sum(axis=1).max():
         return None
-    found = align([paths[0]], [paths[1]], [np.ones(1), np.ones(1)], fundamental(views[0].P, views[1].P), best=1)
-    return first_curve(views, *paths, found[0]) if found and not found[0].flipped else None
+    shift = gaussian_filter1d(shifts[best].astype(float), 4.0, axis=1, mode='nearest')
+    path = Measurement(shift, np.where(seen, 1.0, np.inf), gain, np.ones(2))
+    strips = Strips(centers, normals, speed, strength, shifts, seen, seen)
+    moved = solve(layout, spline, strips, path, views, np.ones(len(layout.s), bool)).spline
+    return moved(np.linspace(layout.s[both[0]], layout.s[both[-1]], 200))
 
 
-def _path(image: np.ndarray, field: np.ndarray, view, guess: Guess, radius: float) -> np.ndarray | None:
-    """(N, 2) undistorted pixels along the device in one plane."""
-    scale = pixels_per_metre(view.P, guess.points)
-    centers, normals, sigma_px = _strips(view, guess, scale)
-    reach = int(np.ceil(WITHIN * sigma_px.max() / SHIFT_PX))
-    shifts = SHIFT_PX * np.arange(-reach, reach + 1)
-    at = (centers[:, None] + shifts[None, :, None] * normals[:, None]).astype(np.float32)
-    strength = _response(image, field, at, radius * scale)
-    score = strength - TRUST * (shifts / sigma_px[:, None]) ** 2 / 2
-    score[np.abs(shifts) > WITHIN * sigma_px[:, None]] = -np.inf
-    best = _most_probable(score)
-    gain = strength[np.arange(len(best)), best] - CLEAR
-    start, stop = _darkest_stretch(gain)
-    if stop - start < SHORTEST * len(best) or (gain[start:stop] > 0).mean() < SEEN:
-        return None
-    shift = gaussian_filter1d(shifts[best[start:stop]], 3.0, mode='nearest')
-    return undistort(view, centers[start:stop] + shift[:, None] * normals[start:stop])
-
-
-def _strips(view, guess: Guess, scale: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, 2) centres and (N, 2) unit normals in pixels of the image as received, (N,) standard deviation in px; those in or near the image."""
-    step = STEP_PX / scale
-    points, s = resample(guess.points, step)
-    out = np.arange(1, BEYOND_PX / STEP_PX + 1)[:, None] * step
-    first, last = (d / np.linalg.norm(d) for d in (points[0] - points[1], points[-2] - points[-3]))
-    points = np.concatenate([points[0] + out[::-1] * first, points, points[-1] + out * last])
-    sigma = np.interp(np.r_[np.zeros(len(out)), s, np.full(len(out), s[-1])], np.linspace(0, s[-1], len(guess.sigma)), guess.sigma) * scale
-    uv = distort(view, project(view.P, points))
-    tangent = np.gradient(uv, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
-    near = ((uv > -WITHIN * sigma[:, None]) & (uv < [view.width, view.height] + WITHIN * sigma[:, None])).all(axis=1)
-    return uv[near], np.c_[-tangent[:, 1], tangent[:, 0]][near], sigma[near]
-
-
-def _response(image: np.ndarray, field: np.ndarray, at: np.ndarray, half_width_px: float) -> np.ndarray:
-    """(N, W) how much darker than beside it each of (N, W, 2) pixels is, over the device's width, in noise deviations; 0 outside the field."""
-    profiles = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    lit = cv2.remap(field, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    half = int(np.ceil((1.6 * half_width_px + 3) / SHIFT_PX))
-    template = shadow(half_width_px, SHIFT_PX * np.arange(-half, half + 1))
+def _response(image: np.ndarray, field: np.ndarray, at: tuple[np.ndarray, np.ndarray], half_width_px: float) -> np.ndarray:
+    """(N, W) how much darker than beside it each pixel at (N, W) u, v is, over the device's width, in noise deviations; 0 outside the field."""
+    profiles = cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    lit = cv2.remap(field, *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    half = int(np.ceil(1.6 * half_width_px + 3))
+    template = shadow(half_width_px, np.arange(-half, half + 1))
     response = -cv2.filter2D(profiles, cv2.CV_32F, (template - template.mean())[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
-    lit = cv2.erode(lit.astype(np.uint8), np.ones((1, 2 * half + 1), np.uint8), borderValue=1) > 0
-    noise = 1.4826 * float(np.median(np.abs(response[lit]))) + 1e-6 if lit.any() else 1.0
+    lit = cv2.erode(lit, np.ones((1, 2 * half + 1), np.uint8), borderValue=255) > 0
+    noise = 1.4826 * float(middle(np.abs(response[lit][::3]))) + 1e-6 if lit.any() else 1.0
     return np.where(lit, np.clip(response / noise, -1.0, STRONGEST), 0.0).astype(np.float32)
 
 
@@ -128,20 +116,16 @@ def _darkest_stretch(gain: np.ndarray) -> tuple[int, int]:
 
 
 def _most_probable(score: np.ndarray) -> np.ndarray:
-    """(N,) column a row of the (N, W) scores: the path of the highest sum that moves by at most a column a row, each move at BEND_COST."""
-    n, width = score.shape
-    total, came = score[0], np.zeros((n, width), np.int8)
-    options = np.empty((3, width), np.float32)
-    for row in range(1, n):
-        options[0] = total
-        options[1, 1:], options[1, 0] = total[:-1] - BEND_COST, -np.inf
-        options[2, :-1], options[2, -1] = total[1:] - BEND_COST, -np.inf
-        choice = options.argmax(axis=0)
-        total = options.max(axis=0) + score[row]
-        came[row] = choice
-    column = int(total.argmax())
+    """(V, N) column a row of the (V, N, W) scores: the path of the highest sum that moves by at most a column a row, each move at BEND_COST."""
+    total = np.full((score.shape[1], len(score), score.shape[2] + 2), -np.inf)      # of paths that end there, with a margin
+    total[..., 1:-1] = score.transpose(1, 0, 2)
+    for before, here in zip(total[:-1], total[1:]):
+        came = np.maximum(before[:, :-2], before[:, 2:]) - BEND_COST
+        here[:, 1:-1] += np.maximum(came, before[:, 1:-1], out=came)
+    plane, column = np.arange(len(score)), total[-1].argmax(axis=1)
     columns = [column]
-    for row in range(n - 1, 0, -1):
-        column += (0, -1, 1)[came[row, column]]
+    for before in total[-2::-1]:
+        reach = before[plane[:, None], column[:, None] + MOVES] - BEND_COST * np.abs(MOVES)
+        column = column + MOVES[reach.argmax(axis=1)]
         columns.append(column)
-    return np.array(columns[::-1])
+    return np.stack(columns[::-1], axis=1) - 1

@@ -56,7 +56,7 @@ def look(prior: Prior, views, sigma_tip: float) -> tuple[Guess | None, str]:
         return None, f'its length is {1000 * length:.4g} mm'
     even, s = resample(points, STEP)
     for view in views:
-        if depth(view.P, even).min() <= 0 or not _in_image(view, project(view.P, even)).any():
+        if depth(view.P, even).min() <= 0 or not in_image(view, project(view.P, even)).any():
             return None, f'it lies outside plane {view.name}\'s image'
     floor = min(FLOOR, sigma_tip)
     return Guess(even, floor + (sigma_tip - floor) * s / s[-1]), ''
@@ -112,11 +112,11 @@ def informed(f: Fit, g: Guess) -> Fit:
 
 def whole(length: float, g: Guess, views) -> bool:
     """Whether a curve of `length` m may be all of the predicted device that stands in both images."""
-    inside = np.all([_in_image(v, project(v.P, g.points)) for v in views], axis=0)
+    inside = np.all([in_image(v, project(v.P, g.points)) for v in views], axis=0)
     predicted = STEP * np.count_nonzero(inside)
     return abs(length - predicted) < LENGTH_SHARE * predicted + g.sigma[-1]
 
 
-def _in_image(view, uv: np.ndarray) -> np.ndarray:
+def in_image(view, uv: np.ndarray) -> np.ndarray:
     """(N,) bool: which undistorted pixels (N, 2) lie in the image."""
     return ((uv > 0) & (uv < [view.width, view.height])).all(axis=1)

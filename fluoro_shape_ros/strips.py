@@ -61,6 +61,17 @@ def half_width_range(half_width_px: float) -> float:
 
 def cut(images, fields, views, points: np.ndarray, tangents: np.ndarray, reach_px: float) -> Strips:
     """Strips of the (H, W) float32 images across the projections of (N, 3) points with (N, 3) tangents dX/ds, one a point and plane."""
+    centers, normals, speed = lay_out(views, points, tangents)
+    offsets = np.arange(-reach_px, reach_px + 1)
+    profiles = np.empty((*speed.shape, len(offsets)), np.float32)
+    inside, lit = np.empty(speed.shape, bool), np.empty(speed.shape, bool)
+    for k, plane in enumerate(zip(images, fields, views, centers, normals)):
+        profiles[k], inside[k], lit[k] = _sample(*plane, offsets)
+    return Strips(centers, normals, speed, profiles, offsets, inside, lit)
+
+
+def lay_out(views, points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres, normals and speed of the strips across the projections of (N, 3) points with (N, 3) tangents dX/ds, see Strips."""
     P = np.stack([v.P for v in views])
     x = points @ P[:, :, :3].transpose(0, 2, 1) + P[:, None, :, 3]
     centers = x[..., :2] / x[..., 2:]
@@ -70,12 +81,15 @@ def cut(images, fields, views, points: np.ndarray, tangents: np.ndarray, reach_p
     normals = np.empty_like(step)
     np.divide(-step[..., 1], np.maximum(speed, 1e-9), out=normals[..., 0])
     np.divide(step[..., 0], np.maximum(speed, 1e-9), out=normals[..., 1])
-    offsets = np.arange(-reach_px, reach_px + 1)
-    profiles = np.empty((*speed.shape, len(offsets)), np.float32)
-    inside, lit = np.empty(speed.shape, bool), np.empty(speed.shape, bool)
-    for k, plane in enumerate(zip(images, fields, views, centers, normals)):
-        profiles[k], inside[k], lit[k] = _sample(*plane, offsets)
-    return Strips(centers, normals, speed, profiles, offsets, inside, lit)
+    return centers, normals, speed
+
+
+def places(view: View | None, centers: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, W) float32 u and v in the image as received, of the samples of N strips at (W,) offsets."""
+    u, v = (c[:, None] + n[:, None] * offsets.astype(np.float32) for c, n in zip(centers.T.astype(np.float32), normals.T.astype(np.float32)))
+    if view is not None and view.distortion is not None:
+        u, v = distort(view, np.stack([u, v], axis=2).reshape(-1, 2)).T.reshape(2, *u.shape).astype(np.float32)
+    return u, v
 
 
 def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], reach_px: float) -> tuple[Strips, np.ndarray]:
@@ -96,10 +110,7 @@ def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], 
 
 def _sample(image, field, view: View | None, centers, normals, offsets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, W) values, (N,) whether the whole strip lies in the field and (N,) whether its middle does."""
-    offsets = offsets.astype(np.float32)
-    u, v = (c[:, None] + n[:, None] * offsets for c, n in zip(centers.T.astype(np.float32), normals.T.astype(np.float32)))
-    if view is not None and view.distortion is not None:
-        u, v = distort(view, np.stack([u, v], axis=2).reshape(-1, 2)).T.reshape(2, *u.shape).astype(np.float32)
+    u, v = places(view, centers, normals, offsets)
     profiles = cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     ends = [0, len(offsets) // 2, -1]
     exposed = cv2.remap(field, u[:, ends], v[:, ends], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
