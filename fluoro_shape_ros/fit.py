@@ -17,7 +17,7 @@ from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
 from .strips import (
-    Measurement, Model, Strips, apparent_width, background, cut, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
+    WIDTHS, Measurement, Model, Strips, apparent_width, background, best_of_worst, cut, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
 
 COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
@@ -54,6 +54,7 @@ class Fit:
     width: float                # how many times as wide as a cylinder of robot_radius it looks
     odd_width: float            # by how much that is more than usual, see strips.odd_width
     likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder so wide
+    weakest: np.ndarray         # (2,) the same where it looks least like one, see strips.best_of_worst
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
 
@@ -167,7 +168,9 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
     contrast = np.array([_contrast(p) for p in profile])
     scale = np.array(half_width) / radius
     across = 1 - (1 - contrast) ** np.clip(middle(strips.speed[:, between]) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
-    width, alike = apparent_width([likeness(pieces(p, between & i)[0], h) for p, i, h in zip(strips.profiles, strips.inside, half_width)])
+    each = [likeness(pieces(p, between & i)[0], h) for p, i, h in zip(strips.profiles, strips.inside, half_width)]
+    width, alike = apparent_width(each)
+    weakest = np.array([best_of_worst(a[:, WIDTHS == width].ravel()) for a in each])
     opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line
     odd = 0.0 if opaque else odd_width(width, float(np.mean(half_width)))
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
@@ -181,7 +184,7 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-                contrast, across, width, odd, alike, np.nan_to_num(beyond), np.zeros((2, 2)))
+                contrast, across, width, odd, alike, weakest, np.nan_to_num(beyond), np.zeros((2, 2)))
     return found, ends
 
 

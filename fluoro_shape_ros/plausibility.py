@@ -11,6 +11,7 @@ from .detect import evidence
 from .fit import Fit, contrast_ratio, ends_shown, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
+MIN_WEAKEST = 0.9      # the same, of the best of the worst pieces in a row
 MAX_ODD_WIDTH = 0.15    # see strips.odd_width: robot_radius may be off by a third
 MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
@@ -30,6 +31,8 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
     if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
         return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
+    if f.weakest.min() < MIN_WEAKEST:
+        return Outcome.POORLY_EXPLAINED, 'part of it does not look like a round device (likeness {:.2f}, {:.2f}): it follows another line there'.format(*f.weakest)
     if f.odd_width > MAX_ODD_WIDTH:
         return Outcome.POORLY_EXPLAINED, f'it looks {f.width:.1f} times as wide as a device of robot_radius'
     ratio = contrast_ratio(f)

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import uniform_filter1d
 
 from .curve import middle
@@ -18,6 +19,7 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips
+STRETCH = 3             # pieces: longer than what hides a device
 OUTER = 0.02            # of a shadow: what is fainter lies beside the device
 SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
@@ -145,6 +147,13 @@ def apparent_width(alike: list[np.ndarray]) -> tuple[float, np.ndarray]:
     typical = np.stack([middle(a, axis=0) if len(a) else np.zeros(len(WIDTHS)) for a in alike])
     best = int(typical.min(axis=0).argmax())
     return float(WIDTHS[best]), typical[:, best]
+
+
+def best_of_worst(alike: np.ndarray) -> float:
+    """Of (B,) likenesses of successive pieces the best of the STRETCH worst ones in a row: low only where a line looks like nothing round for long."""
+    if len(alike) < STRETCH:
+        return float(alike.max(initial=0.0))
+    return float(sliding_window_view(alike, STRETCH).max(axis=1).min())
 
 
 def odd_width(width: float, half_width_px: float) -> float:

@@ -70,7 +70,7 @@ def device(**other):
     clear = dict(spline=straight, start=0.0, stop=0.06, end_sigma=np.full(2, 5e-5), open_end=np.array([False, False]),
                  covariance=np.eye(30) * 1e-10, s=S, presence=present, offset_px=np.zeros((len(S), 2)),
                  contrast=np.array([0.25, 0.25]), across=np.array([0.25, 0.25]), width=0.9, odd_width=0.0,
-                 likeness=np.array([0.99, 0.99]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)))
+                 likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)))
     return Fit(**clear | other)
 
 
@@ -91,6 +91,7 @@ def test_a_clear_device_raises_no_doubt():
     (dict(stop=0.015), Outcome.NO_CORRESPONDENCE, '50 px'),
     (dict(contrast=np.array([0.25, 0.005]), across=np.array([0.25, 0.005])), Outcome.POORLY_EXPLAINED, 'round device'),
     (dict(likeness=np.array([0.5, 0.99])), Outcome.POORLY_EXPLAINED, '0.50'),
+    (dict(weakest=np.array([0.95, 0.7])), Outcome.POORLY_EXPLAINED, 'follows another line'),
     (dict(width=1.5, odd_width=0.31), Outcome.POORLY_EXPLAINED, '1.5 times'),
     (dict(width=0.5, odd_width=0.26), Outcome.POORLY_EXPLAINED, '0.5 times'),
     (dict(end_sigma=np.array([5e-5, 2e-3])), Outcome.DIRECTIONS_DISAGREE, 'last end'),

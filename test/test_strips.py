@@ -12,7 +12,7 @@ from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
 from fluoro_shape_ros.strips import (
-    WIDTHS, Measurement, Model, Strips, apparent_width, background, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow,
+    WIDTHS, Measurement, Model, Strips, apparent_width, background, best_of_worst, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow,
     pieces, search, shadow)
 
 HALF_WIDTH = 2.0        # px
@@ -217,6 +217,12 @@ def test_pieces_are_medians_along_each_line_and_a_short_line_is_one():
     assert_allclose(medians[:, 0], [15, 46, 2, 24])
     nothing, none = pieces(along, np.zeros(115, bool), of)
     assert nothing.shape == (0, 3) and len(none) == 0
+
+
+def test_the_best_of_the_worst_pieces_in_a_row():
+    assert best_of_worst(np.array([0.99, 0.4, 0.95, 0.99])) == 0.99       # hidden in one piece
+    assert best_of_worst(np.array([0.99, 0.7, 0.4, 0.8, 0.99])) == 0.8    # another line for three of them
+    assert best_of_worst(np.array([0.6, 0.7])) == 0.7 and best_of_worst(np.zeros(0)) == 0.0
 
 
 def test_how_wide_a_line_looks_and_when_that_is_odd():
