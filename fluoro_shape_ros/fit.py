@@ -17,7 +17,8 @@ from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
 from .strips import (
-    WIDTHS, Measurement, Model, Strips, apparent_width, background, best_of_worst, cut, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow, pieces, search, shadow)
+    WIDTHS, Measurement, Model, Strips, apparent_width, background, best_of_worst, cut, half_width_range, likeness, mean_profile, measure, odd_width,
+    own_shadow, pieces, search, shadow)
 
 COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
