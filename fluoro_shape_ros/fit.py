@@ -84,7 +84,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         layout = Layout.of(spline, COARSE_STEP * step)
         within = (layout.s >= reference[0]) & (layout.s <= reference[1])
         for _ in range(coarse):
-            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach + WIDE_PX)
+            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach + WIDE_PX, rough=True)
             spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within).spline
         for _ in range(MEDIUM):
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
@@ -240,7 +240,7 @@ def _aside(images, fields, views, f: Fit, half_width) -> np.ndarray:
     """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B; 0 where it leaves the field."""
     reach, px = half_width_range(max(half_width)), np.arange(-80, 20)
     s = (np.array([f.start, f.stop])[:, None] + OUTWARD[:, None] * px * (f.s[1] - f.s[0])).ravel()
-    strips = cut(images, fields, views, *f.spline.lines(s), reach + WIDE_PX).halves()
+    strips = cut(images, fields, views, *f.spline.lines(s), reach + WIDE_PX, rough=True).halves()
     line = search(strips, _shadows(half_width, np.arange(-reach, reach + 1)).repeat(2, axis=0))
     dark = middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
     return np.where(f.open_end[:, None], 0.0, dark)
