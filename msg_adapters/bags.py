@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 from rosbags.highlevel import AnyReader
@@ -21,6 +22,10 @@ from .salvage import Raw, Salvage
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 _SUFFIXES = {'.db3': 'sqlite3'}     # every other one: mcap, as `ros2 bag record` has it
+
+
+# rosbags writes and compiles code for every type of every store
+_jazzy = cache(partial(get_typestore, Stores.ROS2_JAZZY))
 
 
 class BadBag(ValueError):
@@ -44,7 +49,7 @@ class BagReader:
         self._path, self._reader = path, reader
         self._salvage: Salvage | None = None
         self.damage = damage
-        self._typestore = get_typestore(Stores.ROS2_JAZZY) if reader is None else reader.typestore
+        self._typestore = _jazzy() if reader is None else reader.typestore
         if reader is not None:
             self._topics = {c.topic: (c.msgtype, 0) for c in reader.connections}
             for c in reader.connections:    # a topic has one for each QoS offered
@@ -141,7 +146,7 @@ def open_bag(path) -> Iterator[BagReader]:
 
 
 def _opened(path: Path) -> AnyReader:
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+    reader = AnyReader([path], default_typestore=_jazzy())
     reader.open()
     return reader
 
@@ -156,7 +161,7 @@ class BagWriter:
 
     def __init__(self, path: Path, writer: Writer):
         self._path, self._writer = path, writer
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._typestore = _jazzy()
         self._connections = {}
         self.new = bag_message(self._typestore)     # makes the messages, see messages
 

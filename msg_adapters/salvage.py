@@ -18,6 +18,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 ROWS_TRIED = 256                    # damaged rows in sequence after which nothing more is to be expected
+DAMAGED = sqlite3.DatabaseError, MemoryError       # what sqlite3 raises; the other one where a row says that it is huge
 SIZE_LIMIT = 2**30                  # bytes; what says that it is longer is damaged, or made to take all memory
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'    # no CDR message begins like this: compressed one by one
 
@@ -117,7 +118,7 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
         try:
             database.execute('PRAGMA writable_schema=ON')   # reads on where the file is shorter than it says
             topics = {number: (name, kind) for number, name, kind in database.execute('SELECT id, name, type FROM topics')}
-        except sqlite3.DatabaseError:
+        except DAMAGED:
             return
         number, failures = -1, 0
         while failures < ROWS_TRIED:
@@ -127,5 +128,5 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
                     if topic in topics and isinstance(log_ns, int) and isinstance(raw, bytes):
                         yield *topics[topic], log_ns, raw
                 return
-            except sqlite3.DatabaseError:
+            except DAMAGED:
                 number, failures = number + 1, failures + 1

@@ -200,6 +200,18 @@ def test_what_would_take_all_memory_is_left_out(tmp_path, monkeypatch):
             read_all(tmp_path / storage.name)
 
 
+def test_a_row_that_says_it_is_huge_is_named(tmp_path):
+    """What sqlite3 raises is a MemoryError then; fuzz.py found it."""
+    path = write(tmp_path / 'run', 'sqlite3')
+    file = path / 'run.db3'
+    data = bytearray(file.read_bytes())
+    at = data.index(b'tabletopics') - 9     # in a row of sqlite_schema: before these is what lengths its columns have
+    data[at:at + 6] = b'\xff' * 5 + b'e'
+    file.write_bytes(data)
+    with pytest.raises(BadBag, match='can\'t be read as a bag'):
+        read_all(file)
+
+
 def test_fewer_messages_than_announced_are_named(tmp_path):
     path = write(tmp_path / 'run')
     metadata = path / 'metadata.yaml'
