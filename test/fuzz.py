@@ -17,8 +17,13 @@ from typing import ClassVar
 
 import atheris
 
-with atheris.instrument_imports(include=['msg_adapters', 'rosbags']):
+with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.tools.dicom', 'fluoro_shape_ros.tools.dicom_pixels'],
+                                exclude=['pydicom._dicom_dict', 'pydicom._private_dict', 'pydicom._uid_dict', 'pydicom.sr']):
     import cv2
+    import pydicom
+    import xa
+    from pydicom import uid
+    from pydicom.encaps import encapsulate
     import numpy as np
     from mcap.writer import CompressionType, IndexType
     from mcap.writer import Writer as McapWriter
@@ -29,6 +34,8 @@ with atheris.instrument_imports(include=['msg_adapters', 'rosbags']):
 
     from fluoro_shape_ros.config import Config
     from fluoro_shape_ros.limits import bounded
+    from fluoro_shape_ros.tools.dicom import BadDicom, read_run
+    from fluoro_shape_ros.tools.dicom_pixels import pictures
     from fluoro_shape_ros.worker import checked_camera, decode
     from msg_adapters.bags import BadBag, create_bag, open_bag
     from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
@@ -119,8 +126,21 @@ def bag_db3(data: bytes) -> None:
     bag(data, '.db3')
 
 
-TARGETS = {f.__name__: f for f in (image, compressed_image, camera_info, path, bag_mcap, bag_db3)}
-ONE_OF = [name for name in TARGETS for _ in range(1 if name.startswith('bag') else 8)]      # bags take a hundred times as long
+def dicom(data: bytes) -> None:
+    file = Path(SCRATCH.name) / 'run.dcm'
+    file.write_bytes(data)
+    try:
+        run = read_run(file)
+        assert all(np.isfinite(c.P).all() for c in run.calibrations)
+        assert run.times_ns is None or run.times_ns.shape == (len(run.calibrations),)
+        for frame in pictures(run):
+            assert frame.shape == (run.calibrations[0].height, run.calibrations[0].width) and frame.dtype in (np.uint8, np.uint16)
+    except BadDicom as error:
+        assert str(error).isprintable() and len(str(error)) < 600 and 'ecret' not in str(error)
+
+
+TARGETS = {f.__name__: f for f in (image, compressed_image, camera_info, path, bag_mcap, bag_db3, dicom)}
+ONE_OF = [name for name in TARGETS for _ in range(1 if name in ('bag_mcap', 'bag_db3', 'dicom') else 8)]     # files take ten times as long
 SCRATCH = tempfile.TemporaryDirectory(dir='/dev/shm' if Path('/dev/shm').is_dir() else None)    # of the file that is tried
 
 
@@ -148,6 +168,8 @@ def seeds(target: str) -> list[bytes]:
         return [serialized(good_info(), INFO)]
     if target == 'path':
         return [serialized(new(PATH, header=header(new, 1, 'cell'), poses=[new('geometry_msgs/msg/PoseStamped') for _ in range(n)]), PATH) for n in (0, 3)]
+    if target == 'dicom':
+        return xa_runs()
     return sqlite_bags() if target == 'bag_db3' else mcap_bags()
 
 
@@ -177,6 +199,24 @@ def mcap_bags() -> list[bytes]:
         writer.finish()
         found.append(file.getvalue())
     return found
+
+
+def xa_runs() -> list[bytes]:
+    """Runs with all that is read of a header, in every way to write one that is read, and every compression that can be made here."""
+    deep = np.stack([PIXELS, PIXELS * 5]).astype(np.uint16) << 4
+    moving = dict(PositionerPrimaryAngleIncrement=[0, 5], FrameTimeVector=[0, 60], FrameIncrementPointer=0x00181065, PatientOrientation=['L', 'F'])
+    signed = dict(BitsStored=12, HighBit=15, PixelRepresentation=1, PhotometricInterpretation='MONOCHROME1', ImageType=['ORIGINAL', 'PRIMARY', 'BIPLANE B'])
+    large = np.tile(PIXELS, (6, 4))     # JPEG 2000 halves it five times
+    jpeg, jpeg_2000 = (cv2.imencode(suffix, large)[1].tobytes() for suffix in ('.jpg', '.jp2'))
+    encoded = {uid.JPEGBaseline8Bit: jpeg, uid.JPEG2000Lossless: jpeg_2000[jpeg_2000.index(b'\xff\x4f\xff\x51'):]}      # without the file around it
+    found = [xa.make(io.BytesIO(), deep, **moving, **signed),
+             xa.make(io.BytesIO(), deep, syntax=uid.ImplicitVRLittleEndian, FrameTime=None, CineRate=8),
+             xa.make(io.BytesIO(), PIXELS[None], **xa.logarithms()),
+             *(xa.make(io.BytesIO(), large[None], syntax=syntax, pixel_data=encapsulate([frame])) for syntax, frame in encoded.items())]
+    packed = pydicom.dcmread(io.BytesIO(found[0].getvalue()))
+    packed.compress(uid.RLELossless)
+    packed.save_as(file := io.BytesIO())
+    return [file.getvalue() for file in [*found, file]]
 
 
 class Remembered(Typestore):

@@ -18,7 +18,7 @@ import ros_client as ros                            # noqa: E402
 from rcl_interfaces.srv import SetParameters        # noqa: E402
 from rclpy.parameter import Parameter               # noqa: E402
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy       # noqa: E402
-from ros_client import BASE, GOOD, SIZE, STEP_NS, VIEWS, Client, NodeProcess, image_msg, info_msg, points    # noqa: E402
+from ros_client import BASE, GOOD, SIZE, STEP_NS, VIEWS, Client, image_msg, info_msg, points    # noqa: E402
 from rosgraph_msgs.msg import Clock                 # noqa: E402
 from std_srvs.srv import SetBool, Trigger           # noqa: E402
 
@@ -27,25 +27,9 @@ LIMIT = 45.0            # s, for whatever must happen: the machine may be busy
 SECOND = 10**9
 
 
-@pytest.fixture(scope='module', autouse=True)
-def environment():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        yield
-
-
 @pytest.fixture(scope='module')
-def node(environment, tmp_path_factory):
-    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', BASE, ros.RADIUS) as node:
-        yield node
-        assert node.process.poll() is None, node.log
-        assert 'Traceback' not in node.log
-
-
-@pytest.fixture(scope='module')
-def stream(node):
-    with Client() as client:
-        assert client.connected() and client.insist(lambda: client.paths), node.log
+def stream(tmp_path_factory):
+    with ros.answered(tmp_path_factory, BASE, ros.RADIUS) as (_, client):
         yield client
 
 

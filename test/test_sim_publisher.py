@@ -39,7 +39,6 @@ LIMIT_S = 20.0
 @pytest.fixture(autouse=True)
 def own_domain(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', DOMAIN)
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 
 class Ears:
