@@ -159,7 +159,8 @@ def test_a_table_that_can_be_none_is_named(tmp_path, descriptor):
     ('ImageType', 'US', 7), ('PatientOrientation', 'FD', [1.0, 2.0]), ('FrameIncrementPointer', 'LO', 'FrameTime'), ('FrameIncrementPointer', 'AT', [0x00181063] * 2),
     ('ModalityLUTSequence', 'LO', 'abc'), ('PixelIntensityRelationship', 'US', 3), ('PhotometricInterpretation', 'CS', ['MONOCHROME1', 'RGB']),
     ('NumberOfFrames', 'FD', float('nan')), ('PositionerPrimaryAngle', 'FD', float('inf')), ('FrameTime', 'FD', 1e300), ('BitsStored', 'FD', 0.5),
-    ('PixelRepresentation', 'LO', 'maybe'), ('HighBit', 'SS', -1), ('SamplesPerPixel', 'LO', 'one'), ('CineRate', 'FD', 1e-320)])
+    ('PhotometricInterpretation', 'LO', 'GREY\x1b[2J'), ('PixelRepresentation', 'LO', 'maybe'), ('HighBit', 'SS', -1), ('SamplesPerPixel', 'LO', 'one'),
+    ('CineRate', 'FD', 1e-320)])
 def test_attributes_of_another_kind_are_read_or_named(tmp_path, keyword, vr, value):
     """A file says of what kind its values are; `LOG` has a table looked for."""
     path = make(tmp_path / 'run.dcm', BLANK, PixelIntensityRelationship='LOG')

@@ -37,6 +37,11 @@ class BadDicom(ValueError):
     """A file that is no XA run that can be used; the message names it and tells why, without what else is in the file."""
 
 
+def one_line(text: str) -> str:
+    """The begin of what comes from a file, as it may be shown: control characters would command a terminal."""
+    return ''.join(c if c.isprintable() else '?' for c in ' '.join(text.split())[:200])
+
+
 @dataclass(frozen=True)
 class XaRun:
     """A run of one plane: everything but its pixels."""
@@ -138,7 +143,7 @@ def _check_pixels(path: Path, header, count: int) -> None:
     stored = int(_number(path, header, 'BitsStored', 1, allocated, allocated))
     high = int(_number(path, header, 'HighBit', stored - 1, allocated - 1, stored - 1))
     if allocated not in (8, 16) or _number(path, header, 'SamplesPerPixel', 1, 4, 1) != 1 or kind not in ('MONOCHROME1', 'MONOCHROME2'):
-        raise BadDicom(f'{path}: only grey pixels of 8 or 16 bits are read, not {kind or "unknown ones"} of {allocated} ({stored} stored, the highest is {high})')
+        raise BadDicom(f'{path}: only grey pixels of 8 or 16 bits are read, not {one_line(kind)[:16] or "unknown ones"} of {allocated} ({stored} stored, the highest is {high})')
     syntax, size, needed = header.file_meta.TransferSyntaxUID, path.stat().st_size, rows * columns * count * allocated // 8
     if not syntax.is_encapsulated:
         if needed > size:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .dicom import BadDicom, XaRun
+from .dicom import BadDicom, XaRun, one_line
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def pictures(run: XaRun) -> Iterator[np.ndarray]:
         try:
             frame = next(frames, None)
         except Exception as error:      # the last line of defence: each plug-in fails in its own way
-            raise BadDicom(f'{run.path}: frame {number + 1} can\'t be decoded ({type(error).__name__}: {" ".join(str(error).split())[:200]})') from error
+            raise BadDicom(f'{run.path}: frame {number + 1} can\'t be decoded ({type(error).__name__}: {one_line(str(error))})') from error
         if frame is None:
             break
         frame, number = stored_values(frame, header), number + 1
