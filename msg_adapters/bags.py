@@ -132,14 +132,15 @@ def open_bag(path) -> Iterator[BagReader]:
         raise BadBag(f'{path}: no such bag')
     if path.suffix == '.bag':
         raise BadBag(f'{path}: a bag of ROS 1; convert it with rosbags-convert first')
+    reader, reason = None, ''
     try:
-        bag = BagReader(path, _opened(path))
-    except Exception as error:  # the last line of defence: on a damaged file rosbags raises anything from struct.error to AssertionError
-        bag = BagReader(path, None, f'{path}: damaged: {_reason(error)}; what could be read was used')
-        if not bag.types():
-            bag.close()
-            raise BadBag(f'{path}: can\'t be read as a bag ({_reason(error)})') from error
+        reader = _opened(path)
+    except Exception as error:  # on a damaged file rosbags raises anything from struct.error to AssertionError
+        reason = _reason(error)
+    bag = BagReader(path, reader, reason and f'{path}: damaged: {reason}; what could be read was used')
     try:
+        if not reader and not bag.types():
+            raise BadBag(f'{path}: can\'t be read as a bag ({reason})')
         yield bag
     finally:
         bag.close()
@@ -148,6 +149,9 @@ def open_bag(path) -> Iterator[BagReader]:
 def _opened(path: Path) -> AnyReader:
     reader = AnyReader([path], default_typestore=_jazzy())
     reader.open()
+    if wrong := [c for c in reader.connections if not (isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int))]:
+        reader.close()
+        raise TypeError(f'topic {wrong[0].topic!r:.40} has {wrong[0].msgcount!r:.40} messages of type {wrong[0].msgtype!r:.40}')
     return reader
 
 

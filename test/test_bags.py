@@ -200,6 +200,17 @@ def test_what_would_take_all_memory_is_left_out(tmp_path, monkeypatch):
             read_all(tmp_path / storage.name)
 
 
+@pytest.mark.parametrize('line, other', [('message_count: 3', 'message_count: many'), (f'name: {TOPIC}', 'name: [1, 2]'),
+                                         ('type: sensor_msgs/msg/Image', 'type: 7')])
+def test_metadata_of_another_kind_are_damage(tmp_path, line, other):
+    path = write(tmp_path / 'run')
+    text = (path / 'metadata.yaml').read_text()
+    assert line in text
+    (path / 'metadata.yaml').write_text(text.replace(line, other))
+    stamps, damage = read_all(path)
+    assert stamps == [10, 20, 30] and damage
+
+
 def test_a_row_that_says_it_is_huge_is_named(tmp_path):
     """What sqlite3 raises is a MemoryError then; fuzz.py found it."""
     path = write(tmp_path / 'run', 'sqlite3')

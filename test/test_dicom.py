@@ -142,6 +142,14 @@ def test_logarithms_become_intensities_by_the_files_own_table(tmp_path):
     assert [frame.tolist() for frame in dicom_pixels.pictures(run)] == [[[40000] * 4] * 3]
 
 
+def test_a_table_in_bytes(tmp_path):
+    path = make(tmp_path / 'run.dcm', np.array([[[0, 3, 200, 255]]], np.uint8), **logarithms())
+    header = pydicom.dcmread(path)
+    header.ModalityLUTSequence[0]['LUTData'] = pydicom.DataElement(0x00283006, 'OW', (np.arange(256, dtype='<u2') ** 2).tobytes())
+    header.save_as(path)
+    assert [frame.tolist() for frame in dicom_pixels.pictures(dicom.read_run(path))] == [[[0, 9, 40000, 65025]]]
+
+
 def test_a_table_for_signed_logarithms_begins_below_zero(tmp_path):
     table = logarithms(descriptor=[256, -128, 16])
     run = dicom.read_run(make(tmp_path / 'run.dcm', np.array([[[-128, -1, 0, 127]]], np.int8), PixelRepresentation=1, **table))
@@ -269,6 +277,12 @@ def padded(jpeg):
 def larger(jpeg):
     at = jpeg.index(b'\xff\xc0') + 5
     return jpeg[:at] + b'\xff\xf0\xff\xf0' + jpeg[at + 4:]
+
+
+def test_a_sequence_that_ends_too_soon_is_named(files, capsys):
+    """pydicom raises an OSError that does not name the file; fuzz.py found it."""
+    (files / 'short.dcm').write_bytes(bytes(128) + b'DICM\2\0\0\0SQ\4\0\xd2\0\0\0\0')
+    assert 'short.dcm: damaged: ' in refused(capsys, 'short.dcm', 'b.dcm')
 
 
 @pytest.mark.parametrize('change, says', [

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,6 +76,15 @@ def in_order(runs: list[XaRun]) -> list[XaRun]:
 # ---- header
 
 
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Makes whatever pydicom raises on a damaged file a BadDicom; nothing of ours belongs into the block, whose errors would be taken for the file's."""
+    try:
+        yield
+    except Exception as error:      # on a damaged file pydicom raises anything
+        raise BadDicom(f'{path}: damaged: {what} can\'t be read ({type(error).__name__})') from error
+
+
 def _header(path: Path):
     """pydicom's dataset of KEYWORDS. Raises BadDicom."""
     import pydicom
@@ -86,20 +97,18 @@ def _header(path: Path):
     with path.open('rb') as file:
         if file.read(132)[128:] != b'DICM':
             raise BadDicom(f'{path}: not a DICOM file')
-    tags, what = [Tag(keyword) for keyword in KEYWORDS], 'its header'
-    try:
+    with reading(path, 'its header'):
         syntax = read_file_meta_info(path).TransferSyntaxUID
-        if syntax == DEFLATED:      # would be inflated as a whole, to whatever size
-            raise BadDicom(f'{path}: deflated as a whole; save it uncompressed first')
-        if syntax not in pydicom.uid.AllTransferSyntaxes:
-            raise BadDicom(f'{path}: written in a transfer syntax that is not known')
+    if syntax == DEFLATED:      # would be inflated as a whole, to whatever size
+        raise BadDicom(f'{path}: deflated as a whole; save it uncompressed first')
+    if syntax not in pydicom.uid.AllTransferSyntaxes:
+        raise BadDicom(f'{path}: written in a transfer syntax that is not known')
+    tags = [Tag(keyword) for keyword in KEYWORDS]
+    with reading(path, 'its header'):
         header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
-        for what in KEYWORDS:       # noqa: B007 pydicom looks at a value when it is first asked for
-            header.get(what)
-    except (BadDicom, OSError):
-        raise
-    except Exception as error:  # the last line of defence: on a damaged file pydicom raises anything
-        raise BadDicom(f'{path}: damaged: {what} can\'t be read ({type(error).__name__})') from error
+    for keyword in KEYWORDS:
+        with reading(path, keyword):
+            header.get(keyword)     # pydicom looks at a value when it is first asked for
     if str(header.get('SOPClassUID', '')) == ENHANCED_XA:
         raise BadDicom(f'{path}: an Enhanced XA image; only XA images are read')
     return header

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .dicom import BadDicom, XaRun, one_line
+from .dicom import BadDicom, XaRun, one_line, reading
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def pictures(run: XaRun) -> Iterator[np.ndarray]:
     while True:
         try:
             frame = next(frames, None)
-        except Exception as error:      # the last line of defence: each plug-in fails in its own way
+        except Exception as error:      # each plug-in fails in its own way
             raise BadDicom(f'{run.path}: frame {number + 1} can\'t be decoded ({type(error).__name__}: {one_line(str(error))})') from error
         if frame is None:
             break
@@ -53,14 +53,11 @@ def modality_table(run: XaRun) -> Table | None:
     header = run.header
     if header.get('PixelIntensityRelationship') != 'LOG' or not header.get('ModalityLUTSequence'):
         return None
-    try:
+    words = '<u2' if header.file_meta.TransferSyntaxUID.is_little_endian else '>u2'
+    with reading(run.path, 'its Modality LUT'):
         item = header.ModalityLUTSequence[0]
         descriptor, data = np.atleast_1d(item.LUTDescriptor), item.LUTData
-        if isinstance(data, bytes):
-            data = np.frombuffer(data, '<u2' if header.file_meta.TransferSyntaxUID.is_little_endian else '>u2')
-        data = np.atleast_1d(data)
-    except Exception as error:      # as in _header
-        raise BadDicom(f'{run.path}: damaged: its Modality LUT can\'t be read ({type(error).__name__})') from error
+        data = np.frombuffer(data, words) if isinstance(data, bytes) else np.atleast_1d(data)
     if descriptor.shape != (3,) or descriptor.dtype.kind not in 'iu' or data.dtype.kind not in 'iu' or not 8 <= descriptor[2] <= 16:
         raise BadDicom(f'{run.path}: its Modality LUT is no table of 8 to 16 bits')
     entries, first, bits = descriptor.tolist()
@@ -106,12 +103,10 @@ def compressed_frames(run: XaRun) -> Iterator[bytes]:
 
     offsets = run.header.get('ExtendedOffsetTable'), run.header.get('ExtendedOffsetTableLengths')
     with run.path.open('rb') as file:
-        try:
+        with reading(run.path, 'its compressed frames'):
             pydicom.dcmread(file, stop_before_pixels=True, specific_tags=[Tag('Rows')])
             file.seek(12, 1)        # tag, VR and length of the pixel data
             yield from generate_frames(file, number_of_frames=len(run.calibrations), extended_offsets=offsets if all(offsets) else None)
-        except Exception as error:      # as in _header
-            raise BadDicom(f'{run.path}: truncated: its compressed frames can\'t be read ({type(error).__name__})') from error
 
 
 def codestream_size(frame: bytes) -> tuple[int, int, int] | None:
