@@ -1,14 +1,11 @@
-"""Fuzz what reads bytes from elsewhere: `python test/fuzz.py TARGET --runs N`; atheris mutates messages and bags that are in order.
+"""Fuzz what reads bytes from elsewhere: `python test/fuzz.py TARGET --runs N`; atheris mutates messages, bags and DICOM files that are in order.
 
-Whatever the bytes, the adapter either reads them or refuses them by its own exception. Any other one ends the run with a traceback, exit
+Whatever the bytes, the reader either reads them or refuses them by its own exception. Any other one ends the run with a traceback, exit
 code 77, and the bytes in a file crash-*; `python test/fuzz.py TARGET FILE` tries that again.
 """
 
 import argparse
-import contextlib
 import gc
-import io
-import sqlite3
 import sys
 import tempfile
 from functools import lru_cache
@@ -19,16 +16,9 @@ import atheris
 
 with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.tools.dicom', 'fluoro_shape_ros.tools.dicom_pixels'],
                                 exclude=['pydicom._dicom_dict', 'pydicom._private_dict', 'pydicom._uid_dict', 'pydicom.sr']):
-    import cv2
-    import pydicom
-    import xa
-    from pydicom import uid
-    from pydicom.encaps import encapsulate
     import numpy as np
-    from mcap.writer import CompressionType, IndexType
-    from mcap.writer import Writer as McapWriter
+    from fuzz_seeds import COMPRESSED, IMAGE, INFO, PATH, TYPES, new, seeds
     from rosbags.highlevel import anyreader
-    from rosbags.typesys import Stores, get_typestore
     from rosbags.typesys.store import Typestore
     from rosbags.typesys.stores import empty
 
@@ -37,17 +27,10 @@ with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', '
     from fluoro_shape_ros.tools.dicom import BadDicom, read_run
     from fluoro_shape_ros.tools.dicom_pixels import pictures
     from fluoro_shape_ros.worker import checked_camera, decode
-    from msg_adapters.bags import BadBag, create_bag, open_bag
+    from msg_adapters.bags import BadBag, open_bag
     from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
-    from msg_adapters.images import BadImage, array_to_image
-    from msg_adapters.messages import bag_message, header
+    from msg_adapters.images import BadImage
     from msg_adapters.shapes import BadPath, path_to_points
-
-TYPES = get_typestore(Stores.ROS2_JAZZY)
-IMAGE, COMPRESSED, INFO, PATH = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Path'
-HEADER = 'std_msgs/msg/Header'
-new = bag_message(TYPES)
-PIXELS = np.arange(48, dtype=np.uint8).reshape(6, 8)
 
 
 def message(data: bytes, kind: str):
@@ -56,10 +39,6 @@ def message(data: bytes, kind: str):
         return TYPES.deserialize_cdr(data, kind)
     except Exception:   # noqa: BLE001 - not ours: rosbags raises anything on damaged bytes, and BagReader answers for it
         return None
-
-
-def serialized(msg, kind: str) -> bytes:
-    return bytes(TYPES.serialize_cdr(msg, kind))
 
 
 def image(data: bytes) -> None:
@@ -144,83 +123,19 @@ ONE_OF = [name for name in TARGETS for _ in range(1 if name in ('bag_mcap', 'bag
 SCRATCH = tempfile.TemporaryDirectory(dir='/dev/shm' if Path('/dev/shm').is_dir() else None)    # of the file that is tried
 
 
+def beginning(target: str) -> list[bytes]:
+    """What mutations begin with."""
+    return [bytes([ONE_OF.index(name)]) + data for name in TARGETS for data in seeds(name)] if target == 'everything' else seeds(target)
+
+
 def everything(data: bytes) -> None:
     """The first byte says which target gets the rest: a short run of all in one process."""
     if data:
         TARGETS[ONE_OF[data[0] % len(ONE_OF)]](data[1:])
 
 
-def good_info():
-    K = np.array([[100.0, 0, 4], [0, 100, 3], [0, 0, 1]])
-    return new(INFO, header=header(new, 1, 'plane'), height=6, width=8, distortion_model='plumb_bob', d=np.zeros(5), k=K, r=np.eye(3), p=K @ np.eye(3, 4))
-
-
-def seeds(target: str) -> list[bytes]:
-    """Bytes that are in order, to begin with."""
-    pictures = [PIXELS, PIXELS * np.uint16(999), PIXELS.astype(np.float32), np.dstack([PIXELS] * 3)]
-    if target == 'everything':
-        return [bytes([ONE_OF.index(name)]) + data for name in TARGETS for data in seeds(name)]
-    if target == 'image':
-        return [serialized(array_to_image(p, 1, 'plane', new), IMAGE) for p in pictures]
-    if target == 'compressed_image':
-        return [cv2.imencode(suffix, p)[1].tobytes() for suffix, p in (('.png', pictures[0]), ('.png', pictures[1]), ('.jpg', pictures[0]), ('.jpg', pictures[3]))]
-    if target == 'camera_info':
-        return [serialized(good_info(), INFO)]
-    if target == 'path':
-        return [serialized(new(PATH, header=header(new, 1, 'cell'), poses=[new('geometry_msgs/msg/PoseStamped') for _ in range(n)]), PATH) for n in (0, 3)]
-    if target == 'dicom':
-        return xa_runs()
-    return sqlite_bags() if target == 'bag_db3' else mcap_bags()
-
-
-def sqlite_bags() -> list[bytes]:
-    """A bag as rosbags writes it, on pages of 512 bytes: the fewer bytes, the more mutations meet something."""
-    with tempfile.TemporaryDirectory() as folder:
-        with create_bag(Path(folder) / 'bag', 'sqlite3') as out:
-            out.declare('/header', HEADER)
-            out.write('/header', header(new, 1, 'plane'), 5)
-        file = next((Path(folder) / 'bag').glob('*.db3'))
-        with contextlib.closing(sqlite3.connect(file)) as database:
-            database.execute('PRAGMA page_size=512')
-            database.execute('VACUUM')
-        return [file.read_bytes()]
-
-
-def mcap_bags() -> list[bytes]:
-    """Bags with an index and without, chunks of every compression; no checksums, which would refuse every mutation before it is read."""
-    found = []
-    for options in (*(dict(compression=kind) for kind in CompressionType), dict(use_chunking=False), dict(index_types=IndexType.NONE, use_statistics=False)):
-        file = io.BytesIO()
-        writer = McapWriter(file, enable_crcs=False, enable_data_crcs=False, **options)
-        writer.start('ros2')
-        schema = writer.register_schema(HEADER, 'ros2msg', TYPES.generate_msgdef(HEADER, ros_version=2)[0].encode())
-        channel = writer.register_channel('/header', 'cdr', schema)
-        writer.add_message(channel, 5, serialized(header(new, 1, 'plane'), HEADER), 5)
-        writer.finish()
-        found.append(file.getvalue())
-    return found
-
-
-def xa_runs() -> list[bytes]:
-    """Runs with all that is read of a header, in every way to write one that is read, and every compression that can be made here."""
-    deep = np.stack([PIXELS, PIXELS * 5]).astype(np.uint16) << 4
-    moving = dict(PositionerPrimaryAngleIncrement=[0, 5], FrameTimeVector=[0, 60], FrameIncrementPointer=0x00181065, PatientOrientation=['L', 'F'])
-    signed = dict(BitsStored=12, HighBit=15, PixelRepresentation=1, PhotometricInterpretation='MONOCHROME1', ImageType=['ORIGINAL', 'PRIMARY', 'BIPLANE B'])
-    large = np.tile(PIXELS, (6, 4))     # JPEG 2000 halves it five times
-    jpeg, jpeg_2000 = (cv2.imencode(suffix, large)[1].tobytes() for suffix in ('.jpg', '.jp2'))
-    encoded = {uid.JPEGBaseline8Bit: jpeg, uid.JPEG2000Lossless: jpeg_2000[jpeg_2000.index(b'\xff\x4f\xff\x51'):]}      # without the file around it
-    found = [xa.make(io.BytesIO(), deep, **moving, **signed),
-             xa.make(io.BytesIO(), deep, syntax=uid.ImplicitVRLittleEndian, FrameTime=None, CineRate=8),
-             xa.make(io.BytesIO(), PIXELS[None], **xa.logarithms()),
-             *(xa.make(io.BytesIO(), large[None], syntax=syntax, pixel_data=encapsulate([frame])) for syntax, frame in encoded.items())]
-    packed = pydicom.dcmread(io.BytesIO(found[0].getvalue()))
-    packed.compress(uid.RLELossless)
-    packed.save_as(file := io.BytesIO())
-    return [file.getvalue() for file in [*found, file]]
-
-
 class Remembered(Typestore):
-    """A store of the types of a bag that shares the code made for another bag's whose definitions are the same: to make that is 90 % of the time."""
+    """A store of the types of a bag that shares the code made for another bag whose definitions are the same: to make that is 90 % of the time."""
 
     known: ClassVar[dict[str, Typestore]] = {}
 
@@ -253,7 +168,7 @@ def main() -> None:
     hurry()
     gc.freeze()
     with tempfile.TemporaryDirectory() as corpus:
-        for k, data in enumerate(seeds(args.target)):
+        for k, data in enumerate(beginning(args.target)):
             (Path(corpus) / str(k)).write_bytes(data)
         atheris.Setup([sys.argv[0], corpus, f'-runs={args.runs}', f'-seed={args.seed}', '-max_len=65536', '-rss_limit_mb=1024', '-timeout=60', '-verbosity=1'],
                       target)
