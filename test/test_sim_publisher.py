@@ -231,7 +231,7 @@ def test_the_large_image_profile_leaves_the_users_own_alone(monkeypatch):
 
 
 @pytest.mark.parametrize('wrong, reason', [
-    (['--rate', '0'], 'must be positive'),
+    (['--rate', '0'], 'not above zero'),
     (['--sod', '2'], 'sod is 2 m'),
     (['--contrast', '1.5'], 'contrast 1.5'),
     (['--clutter', 'cat'], 'cat'),
