@@ -183,6 +183,14 @@ def test_attributes_of_another_kind_are_read_or_named(tmp_path, keyword, vr, val
         assert str(error).isprintable()
 
 
+@pytest.mark.parametrize('keyword', ['SOPClassUID', 'ImageType', 'Rows', 'PatientOrientation', 'PixelIntensityRelationship'])
+def test_a_sequence_for_a_value_is_named(files, capsys, keyword):
+    header = pydicom.dcmread('a.dcm')
+    header[keyword] = pydicom.DataElement(pydicom.tag.Tag(keyword), 'SQ', [pydicom.Dataset()])
+    header.save_as('a.dcm')
+    assert f'{keyword} is a sequence' in refused(capsys, 'a.dcm', 'b.dcm')
+
+
 def test_compressed_frames(tmp_path):
     """RLE, which pydicom decodes by itself, and JPEG."""
     path = make(tmp_path / 'run.dcm', PAIR[0])

@@ -108,7 +108,9 @@ def _header(path: Path):
         header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
     for keyword in KEYWORDS:
         with reading(path, keyword):
-            header.get(keyword)     # pydicom looks at a value when it is first asked for
+            value = header.get(keyword)     # pydicom looks at a value when it is first asked for
+        if isinstance(value, pydicom.Sequence) and keyword != 'ModalityLUTSequence':    # whose own values it has not looked at yet
+            raise BadDicom(f'{path}: damaged: {keyword} is a sequence')
     if str(header.get('SOPClassUID', '')) == ENHANCED_XA:
         raise BadDicom(f'{path}: an Enhanced XA image; only XA images are read')
     return header
