@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -304,6 +305,12 @@ def test_a_compressed_frame_larger_than_it_says_is_refused_unopened(files, capsy
     make('a.dcm', PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([jpeg] * 2))
     said = refused(capsys, 'a.dcm', 'b.dcm')
     assert says in said or 'needs one of' in said
+
+
+def test_a_decoder_that_ends_its_process_is_named(files, capsys):
+    """A damaged JPEG, found by fuzz.py, on which GDCM 3.2.6 calls std::terminate."""
+    (files / 'a.dcm').write_bytes(Path(__file__).with_name('gdcm_abort.dcm').read_bytes())
+    assert 'can\'t be decoded' in refused(capsys, 'a.dcm', 'b.dcm')
 
 
 def test_filled_up_markers_are_skipped():

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
 from .dicom import BadDicom, XaRun, one_line, reading
+
+DECODER = 'fluoro_shape_ros.tools.dicom_decoder'
 
 
 @dataclass(frozen=True)
@@ -25,27 +31,43 @@ def pictures(run: XaRun) -> Iterator[np.ndarray]:
     Values that are logarithms of the intensity (LOG) become intensities where the file has the table for it (Modality LUT), else they stay.
     Raises BadDicom where a frame can't be decoded.
     """
-    from pydicom.pixels import iter_pixels
-
-    header, table = run.header, modality_table(run)
+    header, table, number = run.header, modality_table(run), 0
     full = 2 ** (table.bits if table else stored_bits(header)) - 1
     check_frames(run)
-    # pydicom takes the lowest BitsStored bits of uncompressed pixels wherever HighBit is
-    all_bits = {} if header.file_meta.TransferSyntaxUID.is_encapsulated else {'bits_stored': int(header.BitsAllocated)}
-    frames, number = iter_pixels(run.path, raw=True, **all_bits), 0
-    while True:
-        try:
-            frame = next(frames, None)
-        except Exception as error:      # each plug-in fails in its own way
-            raise BadDicom(f'{run.path}: frame {number + 1} can\'t be decoded ({type(error).__name__}: {one_line(str(error))})') from error
-        if frame is None:
-            break
+    for frame in decoded(run) if header.file_meta.TransferSyntaxUID.is_encapsulated else uncompressed(run):
         frame, number = stored_values(frame, header), number + 1
         if table:
             frame = table.values[np.clip(frame.astype(np.int32) - table.first, 0, len(table.values) - 1)]
         yield np.ascontiguousarray(full - frame if header.PhotometricInterpretation == 'MONOCHROME1' else frame)
     if number != len(run.calibrations):
         raise BadDicom(f'{run.path}: truncated: {number} of {len(run.calibrations)} frames are there')
+
+
+def uncompressed(run: XaRun) -> Iterator[np.ndarray]:
+    """The frames as they are in the file, bits and all. Raises BadDicom."""
+    from pydicom.pixels import iter_pixels
+
+    with reading(run.path, 'its frames'):       # pydicom takes the lowest BitsStored bits wherever HighBit is
+        yield from iter_pixels(run.path, raw=True, bits_stored=int(run.header.BitsAllocated))
+
+
+def decoded(run: XaRun) -> Iterator[np.ndarray]:
+    """The frames of a compressed run, see dicom_decoder. Raises BadDicom."""
+    with tempfile.TemporaryFile() as said, subprocess.Popen([sys.executable, '-m', DECODER, str(run.path)], stdout=subprocess.PIPE, stderr=said) as child:
+        number = 0
+        try:
+            while child.stdout.peek(1):
+                yield np.lib.format.read_array(SimpleNamespace(read=child.stdout.read), allow_pickle=False)     # see dicom_decoder
+                number += 1
+        except (ValueError, EOFError):     # it ended in the middle of a frame
+            pass
+        finally:
+            child.stdout.close()
+            code = child.wait()
+        if code:
+            said.seek(0)
+            why = one_line((said.read().decode(errors='replace').splitlines() or [''])[-1]) if code > 0 else 'its decoder crashed'
+            raise BadDicom(f'{run.path}: frame {number + 1} can\'t be decoded ({why})')
 
 
 def modality_table(run: XaRun) -> Table | None:
