@@ -29,7 +29,7 @@ EXTRAS = {
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
 # atheris has wheels for these only, and its sources need clang
-EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags']]
+EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags'], *EXTRAS['dicom']]
 EXTRAS['test'] = [*EXTRAS['all'], *EXTRAS['fuzz'], 'pytest>=7.4', 'hypothesis>=6.98']
 
 SHARED = sorted(path for kind in ('xml', 'yaml', 'rviz', 'json', 'html', 'py') for path in glob(f'resource/*.{kind}'))

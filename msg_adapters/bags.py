@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 from rosbags.highlevel import AnyReader
@@ -21,6 +22,10 @@ from .salvage import Raw, Salvage
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 _SUFFIXES = {'.db3': 'sqlite3'}     # every other one: mcap, as `ros2 bag record` has it
+
+
+# rosbags writes and compiles code for every type of every store
+_jazzy = cache(partial(get_typestore, Stores.ROS2_JAZZY))
 
 
 class BadBag(ValueError):
@@ -44,7 +49,7 @@ class BagReader:
         self._path, self._reader = path, reader
         self._salvage: Salvage | None = None
         self.damage = damage
-        self._typestore = get_typestore(Stores.ROS2_JAZZY) if reader is None else reader.typestore
+        self._typestore = _jazzy() if reader is None else reader.typestore
         if reader is not None:
             self._topics = {c.topic: (c.msgtype, 0) for c in reader.connections}
             for c in reader.connections:    # a topic has one for each QoS offered
@@ -127,22 +132,26 @@ def open_bag(path) -> Iterator[BagReader]:
         raise BadBag(f'{path}: no such bag')
     if path.suffix == '.bag':
         raise BadBag(f'{path}: a bag of ROS 1; convert it with rosbags-convert first')
+    reader, reason = None, ''
     try:
-        bag = BagReader(path, _opened(path))
-    except Exception as error:  # the last line of defence: on a damaged file rosbags raises anything from struct.error to AssertionError
-        bag = BagReader(path, None, f'{path}: damaged: {_reason(error)}; what could be read was used')
-        if not bag.types():
-            bag.close()
-            raise BadBag(f'{path}: can\'t be read as a bag ({_reason(error)})') from error
+        reader = _opened(path)
+    except Exception as error:  # on a damaged file rosbags raises anything from struct.error to AssertionError
+        reason = _reason(error)
+    bag = BagReader(path, reader, reason and f'{path}: damaged: {reason}; what could be read was used')
     try:
+        if not reader and not bag.types():
+            raise BadBag(f'{path}: can\'t be read as a bag ({reason})')
         yield bag
     finally:
         bag.close()
 
 
 def _opened(path: Path) -> AnyReader:
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+    reader = AnyReader([path], default_typestore=_jazzy())
     reader.open()
+    if wrong := [c for c in reader.connections if not (isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int))]:
+        reader.close()
+        raise TypeError(f'topic {wrong[0].topic!r:.40} has {wrong[0].msgcount!r:.40} messages of type {wrong[0].msgtype!r:.40}')
     return reader
 
 
@@ -156,7 +165,7 @@ class BagWriter:
 
     def __init__(self, path: Path, writer: Writer):
         self._path, self._writer = path, writer
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._typestore = _jazzy()
         self._connections = {}
         self.new = bag_message(self._typestore)     # makes the messages, see messages
 

@@ -10,14 +10,16 @@ import io
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import zstandard
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+STEPS, LAST_ROW = 1000, 2**63 - 1   # of sqlite3: instructions between two looks at how many it took, and the highest number of a row
 ROWS_TRIED = 256                    # damaged rows in sequence after which nothing more is to be expected
+DAMAGED = sqlite3.DatabaseError, MemoryError       # what sqlite3 raises; the other one where a row says that it is huge
 SIZE_LIMIT = 2**30                  # bytes; what says that it is longer is damaged, or made to take all memory
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'    # no CDR message begins like this: compressed one by one
 
@@ -113,19 +115,31 @@ def _parts(chunk: Chunk) -> list:
 
 def sqlite_messages(path: Path) -> Iterator[Raw]:
     """The messages of a sqlite3 storage file in the order in which they were written."""
+    size = path.stat().st_size
     with contextlib.closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True, check_same_thread=False)) as database:
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, STEPS))    # of a value: none is longer than the file
+        database.set_progress_handler(_patience(size), STEPS)
         try:
             database.execute('PRAGMA writable_schema=ON')   # reads on where the file is shorter than it says
-            topics = {number: (name, kind) for number, name, kind in database.execute('SELECT id, name, type FROM topics')}
-        except sqlite3.DatabaseError:
+            topics = {number: (name, kind) for number, name, kind in database.execute('SELECT id, name, type FROM topics')
+                      if isinstance(name, str) and isinstance(kind, str)}
+        except DAMAGED:
             return
         number, failures = -1, 0
-        while failures < ROWS_TRIED:
+        while failures < ROWS_TRIED and number < LAST_ROW:
             try:
-                for number, topic, log_ns, raw in database.execute(_ROWS_AFTER, (number,)):     # noqa: B007, B020
-                    failures = 0
+                for found, topic, log_ns, raw in database.execute(_ROWS_AFTER, (number,)):     # noqa: B020
+                    if not isinstance(found, int) or found <= number:
+                        return      # pages in a circle
+                    number, failures = found, 0
                     if topic in topics and isinstance(log_ns, int) and isinstance(raw, bytes):
                         yield *topics[topic], log_ns, raw
                 return
-            except sqlite3.DatabaseError:
+            except DAMAGED:
                 number, failures = number + 1, failures + 1
+
+
+def _patience(size: int) -> Callable[[], bool]:
+    """What ends a query of a file of `size` bytes after more than any intact one takes: in a damaged one pages may follow one another without end."""
+    left = iter(range(1000 + size // 100))
+    return lambda: next(left, None) is None

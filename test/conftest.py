@@ -1,4 +1,4 @@
-"""What the tests of the adapters share."""
+"""What tests share."""
 
 import pytest
 
@@ -13,3 +13,11 @@ def new(request):
         return ros_message
     typesys = pytest.importorskip('rosbags.typesys')
     return bag_message(typesys.get_typestore(typesys.Stores.ROS2_JAZZY))
+
+
+@pytest.fixture(scope='session', autouse=True)
+def this_machine_only():
+    """No test hears or disturbs another machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        yield

@@ -246,3 +246,13 @@ class Client:
         """The result of setting a parameter."""
         msg: ParameterMsg = Parameter(name, type_, value).to_parameter_msg()
         return self.call(SetParameters, '/fluoro_shape/set_parameters', SetParameters.Request(parameters=[msg])).results[0]
+
+
+@contextmanager
+def answered(tmp_path_factory, *parameters):
+    """A NodeProcess and a Client that it has answered; when the block is left, the node must be alive and have told of no bug."""
+    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', *parameters) as node, Client() as client:
+        assert client.connected() and client.insist(lambda: client.paths), node.log
+        yield node, client
+        assert node.process.poll() is None, node.log
+        assert 'Traceback' not in node.log, node.log

@@ -1,5 +1,7 @@
 """Bags there and back in both storages, and what is wrong with damaged ones."""
 
+import contextlib
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -198,6 +200,48 @@ def test_what_would_take_all_memory_is_left_out(tmp_path, monkeypatch):
         (tmp_path / storage.name / 'metadata.yaml').unlink()
         with pytest.raises(BadBag, match='can\'t be read as a bag'):
             read_all(tmp_path / storage.name)
+
+
+@pytest.mark.parametrize('line, other', [('message_count: 3', 'message_count: many'), (f'name: {TOPIC}', 'name: [1, 2]'),
+                                         ('type: sensor_msgs/msg/Image', 'type: 7')])
+def test_metadata_of_another_kind_are_damage(tmp_path, line, other):
+    path = write(tmp_path / 'run')
+    text = (path / 'metadata.yaml').read_text()
+    assert line in text
+    (path / 'metadata.yaml').write_text(text.replace(line, other))
+    stamps, damage = read_all(path)
+    assert stamps == [10, 20, 30] and damage
+
+
+@pytest.mark.parametrize('rows', [
+    "(1, 1, 5, x'01'), (1, 1, 6, x'02')", "('a', 1, 5, x'01'), ('b', 1, 6, x'02')", f"({2**63 - 1}, 1, 5, x'01')", "(1, 1, 'now', x'01'), (2, x'01', 5, 7)"])
+def test_rows_that_are_none_end_nothing(tmp_path, rows):
+    with contextlib.closing(sqlite3.connect(tmp_path / 'run.db3')) as database:
+        database.executescript(f'''CREATE TABLE topics(id, name, type); INSERT INTO topics VALUES (1, '/a', 'b'), (2, 3, 4);
+                                   CREATE TABLE messages(id, topic_id, timestamp, data); INSERT INTO messages VALUES {rows};''')
+    assert len(list(salvage.sqlite_messages(tmp_path / 'run.db3'))) <= 1
+
+
+@pytest.mark.parametrize('name', ['topics', 'messages'])
+def test_rows_without_end_are_given_up(tmp_path, name):
+    """As pages that follow one another in a circle give them; fuzz.py found such a file."""
+    with contextlib.closing(sqlite3.connect(tmp_path / 'run.db3')) as database:
+        database.executescript(f'''CREATE TABLE topics(id, name, type); CREATE TABLE messages(id, topic_id, timestamp, data); DROP TABLE {name};
+                                   CREATE VIEW {name} AS WITH RECURSIVE same(x) AS (SELECT 0 UNION ALL SELECT 0 FROM same)
+                                   SELECT x AS id, 'a' AS name, 'b' AS type, x AS topic_id, x AS timestamp, x AS data FROM same;''')
+    assert not list(salvage.sqlite_messages(tmp_path / 'run.db3'))
+
+
+def test_a_row_that_says_it_is_huge_is_named(tmp_path):
+    """What sqlite3 raises is a MemoryError then; fuzz.py found it."""
+    path = write(tmp_path / 'run', 'sqlite3')
+    file = path / 'run.db3'
+    data = bytearray(file.read_bytes())
+    at = data.index(b'tabletopics') - 9     # in a row of sqlite_schema: before these is what lengths its columns have
+    data[at:at + 6] = b'\xff' * 5 + b'e'
+    file.write_bytes(data)
+    with pytest.raises(BadBag, match='can\'t be read as a bag'):
+        read_all(file)
 
 
 def test_fewer_messages_than_announced_are_named(tmp_path):

@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,10 +14,10 @@ pytest.importorskip('mcap')
 pydicom = pytest.importorskip('pydicom', '3.0.1')
 
 from drawing import SIZE, curve, draw                                          # noqa: E402
-from pydicom.dataset import Dataset, FileMetaDataset                        # noqa: E402
 from pydicom.encaps import encapsulate                                      # noqa: E402
-from pydicom.uid import ExplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless, generate_uid    # noqa: E402
+from pydicom.uid import JPEGBaseline8Bit, RLELossless                     # noqa: E402
 from scipy.spatial import cKDTree                                           # noqa: E402
+from xa import PERSON, SID, SOD, logarithms, make                           # noqa: E402
 
 from fluoro_shape_ros.geometry import project, source                       # noqa: E402
 from fluoro_shape_ros.tools import dicom, dicom_pixels, importer, replay    # noqa: E402
@@ -24,31 +26,7 @@ from msg_adapters.images import image_to_array                              # no
 from msg_adapters.messages import stamp_ns                                  # noqa: E402
 from msg_adapters.shapes import path_to_points                              # noqa: E402
 
-SID, SOD, PITCH = 1000.0, 750.0, 0.5        # mm
 WIDE = 4 / 3                                # mm, pitch of the detector on which the device is drawn
-PERSON = dict(PatientName='Secret^Somebody', PatientID='SECRET-0815', PatientBirthDate='19700102', InstitutionName='Secret Hospital',
-              StudyDate='20260102', OperatorsName='Secret^Operator', StudyDescription='SECRET', ContentTime='121314')
-
-
-def make(path, frames, primary=0.0, syntax=ExplicitVRLittleEndian, pixel_data=None, **attributes):
-    """An XA file of (N, H, W) uint8 or uint16 frames; an attribute of None is left out."""
-    frames = np.asarray(frames)
-    bits = 8 * frames.itemsize
-    meta = FileMetaDataset()
-    meta.TransferSyntaxUID, meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = syntax, '1.2.840.10008.5.1.4.1.1.12.1', generate_uid()
-    header = Dataset()
-    header.file_meta = meta
-    given = dict(SOPClassUID=meta.MediaStorageSOPClassUID, SOPInstanceUID=meta.MediaStorageSOPInstanceUID, Modality='XA', Rows=frames.shape[1],
-                 Columns=frames.shape[2], NumberOfFrames=len(frames), SamplesPerPixel=1, PhotometricInterpretation='MONOCHROME2', BitsAllocated=bits,
-                 BitsStored=bits, HighBit=bits - 1, PixelRepresentation=0, PixelIntensityRelationship='LIN', DistanceSourceToDetector=SID,
-                 DistanceSourceToPatient=SOD, ImagerPixelSpacing=[PITCH, PITCH], PositionerPrimaryAngle=primary, PositionerSecondaryAngle=0.0, FrameTime=100.0)
-    for keyword, value in (PERSON | given | attributes).items():
-        if value is not None:
-            setattr(header, keyword, value)
-    header.PixelData = pixel_data or frames.tobytes()
-    header['PixelData'].VR = 'OB' if bits == 8 or pixel_data else 'OW'
-    header.save_as(path, enforce_file_format=True)
-    return path
 
 
 def seen(angle):
@@ -161,11 +139,57 @@ def test_pixels_as_stored(tmp_path, raw, attributes, value):
 
 
 def test_logarithms_become_intensities_by_the_files_own_table(tmp_path):
-    table = Dataset()
-    table.LUTDescriptor, table.ModalityLUTType, table.LUTData = [256, 0, 16], 'US', [k * k for k in range(256)]
-    table['LUTData'].VR = 'US'
-    run = dicom.read_run(make(tmp_path / 'run.dcm', np.full((1, 3, 4), 200, np.uint8), PixelIntensityRelationship='LOG', ModalityLUTSequence=[table]))
+    run = dicom.read_run(make(tmp_path / 'run.dcm', np.full((1, 3, 4), 200, np.uint8), **logarithms()))
     assert [frame.tolist() for frame in dicom_pixels.pictures(run)] == [[[40000] * 4] * 3]
+
+
+def test_a_table_in_bytes(tmp_path):
+    path = make(tmp_path / 'run.dcm', np.array([[[0, 3, 200, 255]]], np.uint8), **logarithms())
+    header = pydicom.dcmread(path)
+    header.ModalityLUTSequence[0]['LUTData'] = pydicom.DataElement(0x00283006, 'OW', (np.arange(256, dtype='<u2') ** 2).tobytes())
+    header.save_as(path)
+    assert [frame.tolist() for frame in dicom_pixels.pictures(dicom.read_run(path))] == [[[0, 9, 40000, 65025]]]
+
+
+def test_a_table_for_signed_logarithms_begins_below_zero(tmp_path):
+    table = logarithms(descriptor=[256, -128, 16])
+    run = dicom.read_run(make(tmp_path / 'run.dcm', np.array([[[-128, -1, 0, 127]]], np.int8), PixelRepresentation=1, **table))
+    assert [frame.tolist() for frame in dicom_pixels.pictures(run)] == [[[0, 127**2, 128**2, 255**2]]]
+
+
+@pytest.mark.parametrize('descriptor', [[256, 0, 65535], [0, 0, 16], [256, 0], [256, 0, 8], [1, 0, 16]])
+def test_a_table_that_can_be_none_is_named(tmp_path, descriptor):
+    run = dicom.read_run(make(tmp_path / 'run.dcm', np.full((1, 3, 4), 200, np.uint8), **logarithms(descriptor)))
+    with pytest.raises(dicom.BadDicom, match='its Modality LUT'):
+        next(dicom_pixels.pictures(run))
+
+
+@pytest.mark.parametrize('keyword, vr, value', [
+    ('ImageType', 'US', 7), ('PatientOrientation', 'FD', [1.0, 2.0]), ('FrameIncrementPointer', 'LO', 'FrameTime'), ('FrameIncrementPointer', 'AT', [0x00181063] * 2),
+    ('ModalityLUTSequence', 'LO', 'abc'), ('PixelIntensityRelationship', 'US', 3), ('PhotometricInterpretation', 'CS', ['MONOCHROME1', 'RGB']),
+    ('NumberOfFrames', 'FD', float('nan')), ('PositionerPrimaryAngle', 'FD', float('inf')), ('FrameTime', 'FD', 1e300), ('BitsStored', 'FD', 0.5),
+    ('PhotometricInterpretation', 'LO', 'GREY\x1b[2J'), ('PixelRepresentation', 'LO', 'maybe'), ('HighBit', 'SS', -1), ('SamplesPerPixel', 'LO', 'one'),
+    ('CineRate', 'FD', 1e-320)])
+def test_attributes_of_another_kind_are_read_or_named(tmp_path, keyword, vr, value):
+    """A file says of what kind its values are; `LOG` has a table looked for."""
+    path = make(tmp_path / 'run.dcm', BLANK, PixelIntensityRelationship='LOG')
+    header = pydicom.dcmread(path)
+    with warnings.catch_warnings(action='ignore'):
+        header[keyword] = pydicom.DataElement(pydicom.tag.Tag(keyword), vr, value)
+        header.save_as(path)
+    try:
+        run = dicom.read_run(path)
+        assert all(np.isfinite(c.P).all() for c in run.calibrations) and len(list(dicom_pixels.pictures(run))) == 2
+    except dicom.BadDicom as error:
+        assert str(error).isprintable()
+
+
+@pytest.mark.parametrize('keyword', ['SOPClassUID', 'ImageType', 'Rows', 'PatientOrientation', 'PixelIntensityRelationship'])
+def test_a_sequence_for_a_value_is_named(files, capsys, keyword):
+    header = pydicom.dcmread('a.dcm')
+    header[keyword] = pydicom.DataElement(pydicom.tag.Tag(keyword), 'SQ', [pydicom.Dataset()])
+    header.save_as('a.dcm')
+    assert f'{keyword} is a sequence' in refused(capsys, 'a.dcm', 'b.dcm')
 
 
 def test_compressed_frames(tmp_path):
@@ -184,7 +208,7 @@ def test_compressed_frames(tmp_path):
             pytest.skip('no plug-in for JPEG')
         raise
     assert len(frames) == 2 and np.abs(frames[1].astype(int) - PAIR[0][0]).max() < 20
-    assert dicom_pixels.codestream_size(jpeg) == (SIZE, SIZE)
+    assert dicom_pixels.codestream_size(jpeg) == (SIZE, SIZE, 1)
 
 
 # ---- through the command line
@@ -254,13 +278,49 @@ def test_files_that_are_none(files, capsys):
     assert 'coincide' in refused(capsys, 'a.dcm', make('again.dcm', PAIR[0], ImagerPixelSpacing=[WIDE, WIDE]))
 
 
-def test_a_compressed_frame_larger_than_it_says_is_refused_unopened(files, capsys):
-    jpeg = bytearray(cv2.imencode('.jpg', PAIR[0][0])[1].tobytes())
+def padded(jpeg):
+    """With filled up markers, which is allowed."""
+    return jpeg.replace(b'\xff\xc0', b'\xff\xff\xff\xc0', 1)
+
+
+def larger(jpeg):
     at = jpeg.index(b'\xff\xc0') + 5
-    jpeg[at:at + 4] = b'\xff\xf0\xff\xf0'
-    make('a.dcm', PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([bytes(jpeg)] * 2))
+    return jpeg[:at] + b'\xff\xf0\xff\xf0' + jpeg[at + 4:]
+
+
+def test_a_sequence_that_ends_too_soon_is_named(files, capsys):
+    """pydicom raises an OSError that does not name the file; fuzz.py found it."""
+    (files / 'short.dcm').write_bytes(bytes(128) + b'DICM\2\0\0\0SQ\4\0\xd2\0\0\0\0')
+    assert 'short.dcm: damaged: ' in refused(capsys, 'short.dcm', 'b.dcm')
+
+
+@pytest.mark.parametrize('change, says', [
+    (larger, 'frame 1 is 65520x65520 px inside, but 320x320 by the header'),
+    (lambda jpeg: padded(larger(jpeg)), 'frame 1 is 65520x65520 px inside'),
+    (lambda jpeg: cv2.imencode('.jpg', np.dstack([PAIR[0][0]] * 3))[1].tobytes(), '320x320 px of 3 colours'),
+    (lambda jpeg: b'\0' * len(jpeg), 'it does not say how large it is'),
+])
+def test_a_compressed_frame_larger_than_it_says_is_refused_unopened(files, capsys, change, says):
+    jpeg = change(cv2.imencode('.jpg', PAIR[0][0])[1].tobytes())
+    make('a.dcm', PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([jpeg] * 2))
     said = refused(capsys, 'a.dcm', 'b.dcm')
-    assert 'frame 1 is 65520x65520 px inside, but 320x320 by the header' in said or 'needs one of' in said
+    assert says in said or 'needs one of' in said
+
+
+def test_a_decoder_that_ends_its_process_is_named(files, capsys):
+    """A damaged JPEG, found by fuzz.py, on which GDCM 3.2.6 calls std::terminate."""
+    (files / 'a.dcm').write_bytes(Path(__file__).with_name('gdcm_abort.dcm').read_bytes())
+    assert 'can\'t be decoded' in refused(capsys, 'a.dcm', 'b.dcm')
+
+
+def test_filled_up_markers_are_skipped():
+    jpeg = cv2.imencode('.jpg', PAIR[0][0])[1].tobytes()
+    assert dicom_pixels.codestream_size(padded(jpeg)) == dicom_pixels.codestream_size(jpeg) == (SIZE, SIZE, 1)
+
+
+def test_more_than_a_file_can_hold_is_refused(files, capsys):
+    make('a.dcm', PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([b'12345678'] * 2), Rows=8192, Columns=8192)
+    assert '2 frames of 8192x8192 px are more than 1000 times as large as the file' in (said := refused(capsys, 'a.dcm', 'b.dcm')) or 'needs one of' in said
 
 
 def test_garbage_never_ends_in_another_error(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip('atheris')
 pytest.importorskip('rosbags')
+pytest.importorskip('pydicom', '3.0.1')
 
 FUZZ = Path(__file__).with_name('fuzz.py')
 

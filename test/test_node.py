@@ -14,33 +14,17 @@ from nav_msgs.msg import Path                       # noqa: E402
 from rcl_interfaces.srv import GetParameters        # noqa: E402
 from rclpy.parameter import Parameter               # noqa: E402
 from rclpy.qos import ReliabilityPolicy             # noqa: E402
-from ros_client import BASE, BLANK, GOOD, SIZE, VIEWS, Client, NodeProcess, image_msg, info_msg, points     # noqa: E402
+from ros_client import BASE, BLANK, GOOD, SIZE, VIEWS, Client, image_msg, info_msg, points     # noqa: E402
 from std_srvs.srv import SetBool                    # noqa: E402
 
 TOLERANCE = 0.0025      # m: an image pixel is 1 mm, the line is drawn on whole pixels
 PARAMETERS = ('reference_frame:=cell', 'mask_frames:=2', BASE, ros.RADIUS)
 
 
-@pytest.fixture(scope='module', autouse=True)
-def environment():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        yield
-
-
 @pytest.fixture(scope='module')
-def node(environment, tmp_path_factory):
-    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', *PARAMETERS) as node:
-        yield node
-        assert node.process.poll() is None, node.log
-        assert 'Traceback' not in node.log
-
-
-@pytest.fixture(scope='module')
-def stream(node):
+def stream(tmp_path_factory):
     """One client for all; where it stops, the next test goes on."""
-    with Client() as client:
-        assert client.connected() and client.insist(lambda: client.paths), node.log
+    with ros.answered(tmp_path_factory, *PARAMETERS) as (_, client):
         assert client.good()    # by now none of the first ones is under way
         yield client
 
@@ -291,10 +275,10 @@ def test_tf_is_refused_where_it_is_not_installed(client):
     assert not result.successful and 'needs tf2_ros, which is not installed' in result.reason
 
 
-def test_a_best_effort_publisher_is_heard(node, stream):
+def test_a_best_effort_publisher_is_heard(stream):
     """Beside the reliable one; diagnostics say so, and with best-effort gone it is heard reliably again."""
     with Client(ReliabilityPolicy.BEST_EFFORT, start_ns=stream.now_ns) as client:
-        assert client.connected() and client.good(), node.log
+        assert client.connected() and client.good()
         assert client.hears('best-effort')
         assert client.value('plane a', 'reliability') == 'best_effort'
         stream.now_ns = client.now_ns

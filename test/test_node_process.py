@@ -17,11 +17,6 @@ from ros_client import BASE, Client, NodeProcess    # noqa: E402
 from fluoro_shape_ros.resources import resource_path    # noqa: E402
 
 
-@pytest.fixture(autouse=True)
-def environment(monkeypatch):
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-
-
 @pytest.fixture
 def log(tmp_path):
     return tmp_path / 'log.txt'

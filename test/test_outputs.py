@@ -18,19 +18,10 @@ ON_DEMAND = {'tip_pose': PoseWithCovarianceStamped, 'backbone_points': PointClou
              'plane_a/overlay': Image, 'plane_b/overlay': Image}
 
 
-@pytest.fixture(scope='module', autouse=True)
-def environment():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        yield
-
-
 @pytest.fixture(scope='module')
-def client(environment, tmp_path_factory):
-    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', 'reference_frame:=cell', BASE, ros.RADIUS) as node, Client() as client:
-        assert client.connected() and client.good(), node.log
+def client(tmp_path_factory):
+    with ros.answered(tmp_path_factory, 'reference_frame:=cell', BASE, ros.RADIUS) as (_, client):
         yield client
-        assert node.process.poll() is None and 'Traceback' not in node.log, node.log
 
 
 @pytest.fixture(scope='module')

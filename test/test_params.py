@@ -1,6 +1,5 @@
 """Parameters on a real rclpy node (no executor, no traffic)."""
 
-import os
 
 import pytest
 
@@ -16,14 +15,10 @@ from fluoro_shape_ros.config import Config, ConfigError, fields     # noqa: E402
 
 @pytest.fixture(scope='module')
 def context():
-    before = {k: os.environ.get(k) for k in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')}
-    os.environ.update(ROS_DOMAIN_ID='61', ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     context = Context()
-    rclpy.init(context=context)
+    rclpy.init(context=context, domain_id=61)
     yield context
     rclpy.shutdown(context=context)
-    for key, value in before.items():
-        os.environ.pop(key) if value is None else os.environ.update({key: value})
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from fluoro_shape_ros.geometry import decompose, make_view, undistort
 from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.sim.xray import Exposure
 
 SIZE = 512
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
@@ -305,6 +306,20 @@ def test_a_device_that_is_gone_is_not_tracked_on(scene, blank, config, answer):
 def test_doubts_reject_by_name(scene, config, values, outcome):
     result = reconstruct(scene.frame, config.replace(**values))
     assert result.outcome is outcome and result.detail
+
+
+@pytest.mark.parametrize('seed', [0, 1, 3])
+@pytest.mark.parametrize('contrast, outcome', [(0.9, Outcome.OK), (0.25, Outcome.POORLY_EXPLAINED)])
+def test_an_opaque_line_is_the_device_whatever_its_width(seed, contrast, outcome):
+    """1.9 times as wide as robot_radius says: nothing else is opaque, but a rib or a vessel may well be so wide."""
+    scene = xray_run(seed, anatomy=False, exposure=Exposure(contrast=contrast), **RUN).scene()
+    given = Config.from_values(robot_radius=scene.radius / 1.9, base_position=scene.base_position.tolist())
+    result = reconstruct(scene.frame, given)
+    assert result.outcome is outcome, result.detail
+    if outcome is Outcome.OK:
+        assert off(result.shape.points, scene.truth).mean() < 0.05e-3 and np.linalg.norm(result.shape.tip - scene.truth[-1]) < 0.3e-3
+    else:
+        assert 'times as wide' in result.detail
 
 
 def test_limits_that_are_kept_reject_nothing(scene, config, answer):

@@ -12,7 +12,7 @@ import ros_client as ros                            # noqa: E402
 from geometry_msgs.msg import PoseStamped           # noqa: E402
 from nav_msgs.msg import Path                       # noqa: E402
 from rclpy.serialization import serialize_message   # noqa: E402
-from ros_client import BASE, GOOD, VIEWS, Client, NodeProcess, image_msg, info_msg     # noqa: E402
+from ros_client import BASE, GOOD, VIEWS, image_msg, info_msg     # noqa: E402
 
 from fluoro_shape_ros.resources import resource_path        # noqa: E402
 
@@ -21,27 +21,11 @@ MOST_MB = 2000      # of resident memory, ever: some of the largest images that 
 OPTIONAL = {'/plane_a/image_raw/compressed', '/plane_b/image_raw/compressed', '/tf', '/tf_static', '/clock'}   # subscribed only when a parameter says so
 
 
-@pytest.fixture(scope='module', autouse=True)
-def environment():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        yield
-
-
 @pytest.fixture(scope='module')
-def node(environment, tmp_path_factory):
-    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', BASE, ros.RADIUS) as node:
-        yield node
-        assert node.process.poll() is None, node.log
-        assert 'Traceback' not in node.log
-        assert peak_mb(node) < MOST_MB
-
-
-@pytest.fixture(scope='module')
-def stream(node):
-    with Client() as client:
-        assert client.connected() and client.insist(lambda: client.paths), node.log
+def stream(tmp_path_factory):
+    with ros.answered(tmp_path_factory, BASE, ros.RADIUS) as (node, client):
         yield client
+        assert peak_mb(node) < MOST_MB
 
 
 @pytest.fixture

@@ -52,8 +52,7 @@ rclpy = pytest.importorskip('rclpy')
 
 
 @pytest.fixture
-def controller(monkeypatch):
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+def controller():
     rclpy.init(domain_id=1 + 2 * (os.getpid() % 50))
     node = runpy.run_path(str(resource_path(EXAMPLE)))['Controller']()
     sent = []

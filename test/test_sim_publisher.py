@@ -39,7 +39,6 @@ LIMIT_S = 20.0
 @pytest.fixture(autouse=True)
 def own_domain(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', DOMAIN)
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 
 class Ears:
@@ -232,7 +231,7 @@ def test_the_large_image_profile_leaves_the_users_own_alone(monkeypatch):
 
 
 @pytest.mark.parametrize('wrong, reason', [
-    (['--rate', '0'], 'must be positive'),
+    (['--rate', '0'], 'not above zero'),
     (['--sod', '2'], 'sod is 2 m'),
     (['--contrast', '1.5'], 'contrast 1.5'),
     (['--clutter', 'cat'], 'cat'),

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from ..config import fields
 from . import bench_prior, latency, memory, speed
 from .bench_table import plain, rows, table
-from .cli import ToolError, need, run
+from .cli import ToolError, count, natural, need, positive, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, on_real
 from .latency import moving_scenes
@@ -42,11 +42,11 @@ def main(argv=None) -> int:
 def _add_speed(commands) -> None:
     text = 'how long a pair takes, checked against truth, in ms and in multiples of a yardstick that is timed in between'
     command = commands.add_parser('speed', help=text, description=f'{text[0].upper()}{text[1:]}.')
-    command.add_argument('--sizes', type=_count, nargs='+', default=[512, 768, 1024, 1536, 2048], metavar='PX',
+    command.add_argument('--sizes', type=count, nargs='+', default=[512, 768, 1024, 1536, 2048], metavar='PX',
                          help='image sizes; all show the same field at the same dose (default: 512 768 1024 1536 2048)')
-    command.add_argument('--scenes', type=_count, default=20, metavar='N', help='anatomy scenes of each size (default: 20)')
-    command.add_argument('--rounds', type=_count, default=5, metavar='N', help='how often each is timed, all others in between (default: 5)')
-    command.add_argument('--first-seed', type=_seed, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    command.add_argument('--scenes', type=count, default=20, metavar='N', help='anatomy scenes of each size (default: 20)')
+    command.add_argument('--rounds', type=count, default=5, metavar='N', help='how often each is timed, all others in between (default: 5)')
+    command.add_argument('--first-seed', type=natural, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
     command.add_argument('--alone', action='store_true', help='without method paper and skimage\'s frangi, which take seconds a pair')
     command.add_argument('--json', type=Path, metavar='FILE', help='write every time there, in s')
     command.set_defaults(body=_speed)
@@ -56,9 +56,9 @@ def _add_prior(commands) -> None:
     prior = commands.add_parser('prior', help='what a predicted_backbone is worth on the first pair, good or wrong')
     prior.add_argument('--families', nargs='+', metavar='NAME', choices=[*ACCURACY, *ROBUSTNESS], default=list(bench_prior.FAMILIES),
                        help=f'see accuracy and robustness (default: {" ".join(bench_prior.FAMILIES)})')
-    prior.add_argument('--scenes', type=_count, default=10, metavar='N', help='scenes of each family (default: 10)')
-    prior.add_argument('--rounds', type=_count, default=3, metavar='N', help='how often each is timed (default: 3)')
-    prior.add_argument('--first-seed', type=_seed, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    prior.add_argument('--scenes', type=count, default=10, metavar='N', help='scenes of each family (default: 10)')
+    prior.add_argument('--rounds', type=count, default=3, metavar='N', help='how often each is timed (default: 3)')
+    prior.add_argument('--first-seed', type=natural, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
     prior.set_defaults(body=_prior)
 
 
@@ -85,8 +85,8 @@ def _speed(args, parser: argparse.ArgumentParser) -> int:
 def _add_latency(commands) -> None:
     text = 'how late an answer is on real topics, beside CPU, memory, start-up and what is lost, at several rates'
     command = commands.add_parser('latency', help=text, description=f'{text[0].upper()}{text[1:]}: the node runs as a process of its own.')
-    command.add_argument('--rates', type=_positive, nargs='+', default=[7.5, 15, 30, 60, 200], metavar='HZ', help='pairs a second (default: 7.5 15 30 60 200)')
-    command.add_argument('--seconds', type=_positive, default=60.0, metavar='S', help='at each rate (default: 60)')
+    command.add_argument('--rates', type=positive, nargs='+', default=[7.5, 15, 30, 60, 200], metavar='HZ', help='pairs a second (default: 7.5 15 30 60 200)')
+    command.add_argument('--seconds', type=positive, default=60.0, metavar='S', help='at each rate (default: 60)')
     command.add_argument('--as-shipped', action='store_true', help='Fast DDS as it comes, without this package\'s profile for megapixel images')
     command.add_argument('--full', action='store_true', help='parameter tracking off: every pair is searched from scratch')
     _add_node_options(command)
@@ -96,16 +96,16 @@ def _add_latency(commands) -> None:
 def _add_memory(commands) -> None:
     text = 'whether the node\'s memory grows'
     command = commands.add_parser('memory', help=text, description=f'{text[0].upper()}{text[1:]}: it runs as a process of its own, on real topics.')
-    command.add_argument('--pairs', type=_count, default=10_000, metavar='N', help='(default: 10000)')
+    command.add_argument('--pairs', type=count, default=10_000, metavar='N', help='(default: 10000)')
     command.add_argument('--everything', action='store_true', help='subscribe to overlays, markers and points too')
     _add_node_options(command)
     command.set_defaults(body=_memory)
 
 
 def _add_node_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument('--size', type=_count, default=1024, metavar='PX', help='of the images (default: 1024)')
-    command.add_argument('--rendered', type=_count, default=32, metavar='N', help='pairs that are rendered beforehand and played forth and back (default: 32)')
-    command.add_argument('--seed', type=_seed, default=DEVICE, help='another seed is another device and anatomy')
+    command.add_argument('--size', type=count, default=1024, metavar='PX', help='of the images (default: 1024)')
+    command.add_argument('--rendered', type=count, default=32, metavar='N', help='pairs that are rendered beforehand and played forth and back (default: 32)')
+    command.add_argument('--seed', type=natural, default=DEVICE, help='another seed is another device and anatomy')
     command.add_argument('--domain', type=int, choices=range(233), default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     command.add_argument('--json', type=Path, metavar='FILE', help='write what was measured there, in s and bytes')
 
@@ -153,9 +153,9 @@ def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> 
     command.add_argument('--families', nargs='+', metavar='NAME', help='(default: all)')
     command.add_argument('--methods', nargs='+', metavar='METHOD', choices=METHODS, default=list(METHODS),
                          help=f'of {", ".join(METHODS)} (default: all)')
-    command.add_argument('--scenes', type=_count, default=20, metavar='N', help='scenes of each family (default: 20)')
+    command.add_argument('--scenes', type=count, default=20, metavar='N', help='scenes of each family (default: 20)')
     command.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
-    command.add_argument('--jobs', type=_count, default=2, metavar='N',
+    command.add_argument('--jobs', type=count, default=2, metavar='N',
                          help='processes of one thread each; the table does not depend on it (default: 2)')
     command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every scene\'s answers there, in m')
     command.add_argument('--plot', type=Path, metavar='FILE.png', help='draw errors and shares')
@@ -208,25 +208,6 @@ def _plain(trial: Trial) -> dict:
 def _plain_answer(a: Answer) -> dict:
     return {'outcome': a.outcome.value, 'detail': a.detail, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None,
             'surprise': None if math.isnan(a.surprise) else min(a.surprise, 1e12), 'within': a.within, 'silent_failure': a.silent_failure}
-
-
-def _positive(text: str) -> float:
-    if not 0 < (number := float(text)) < 1e6:
-        raise argparse.ArgumentTypeError(f'{text} is not above zero')
-    return number
-
-
-def _seed(text: str) -> int:
-    if (number := int(text)) < 0:
-        raise argparse.ArgumentTypeError(f'{text}: seeds count from 0')
-    return number
-
-
-def _count(text: str) -> int:
-    """A number of things, at least one."""
-    if (number := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f'{text}: at least one is needed')
-    return number
 
 
 if __name__ == '__main__':

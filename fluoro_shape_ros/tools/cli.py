@@ -32,3 +32,27 @@ def need(module: str, extra: str):
         return importlib.import_module(module)
     except ImportError as error:
         raise ToolError(f'needs {module.split(".")[0]}, which is not installed here ({error}): pip install "fluoro_shape_ros[{extra}]"') from error
+
+
+# ---- types of arguments
+
+
+def positive(text: str) -> float:
+    """A number above zero, and not beyond all measure."""
+    if not 0 < (number := float(text)) < 1e12:
+        raise argparse.ArgumentTypeError(f'{text} is not above zero, or endless')
+    return number
+
+
+def natural(text: str) -> int:
+    """0, 1, 2, ..."""
+    if (number := int(text)) < 0:
+        raise argparse.ArgumentTypeError(f'{text} is below zero')
+    return number
+
+
+def count(text: str) -> int:
+    """A number of things, at least one."""
+    if (number := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f'{text}: at least one is needed')
+    return number

@@ -38,8 +38,8 @@ def _parser() -> argparse.ArgumentParser:
         description='Watch a moving continuum device being reconstructed from two simulated X-ray streams, live on ROS 2 topics: starts '
                     'fluoro_shape_sim and fluoro_shape_node, compares results with ground truth, ends with a summary and pictures.')
     add = parser.add_argument
-    add('--seconds', type=_positive, default=20.0, metavar='S', help='how long')
-    add('--rate', type=_positive, default=5.0, metavar='HZ', help='pairs a second')
+    add('--seconds', type=cli.positive, default=20.0, metavar='S', help='how long')
+    add('--rate', type=cli.positive, default=5.0, metavar='HZ', help='pairs a second')
     add('--seed', type=int, default=9, help='another seed is another device')
     add('--method', choices=method.metadata['choices'], default=method.default, help='parameter of the node')
     add('--renderer', choices=('xray', 'vtk'), default='xray', help='X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011')
@@ -47,13 +47,6 @@ def _parser() -> argparse.ArgumentParser:
     add('--out', type=Path, default=Path('fluoro_shape_demo'), metavar='FOLDER', help='pictures and logs go there')
     add('--domain', type=int, default=47, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     return parser
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f'{text} is not above zero')
-    return value
 
 
 def _run(args) -> int:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,16 +26,22 @@ from ..sim.carm import camera_from_patient
 ENHANCED_XA = '1.2.840.10008.5.1.4.1.1.12.1.1'
 DEFLATED = '1.2.840.10008.1.2.1.99'
 MAX_SIDE, MAX_FRAMES = 8192, 100_000        # px; no angiograph makes more
+MAX_RATIO = 1000            # of a run to its file; no compression of X-ray images with noise comes near
 KEYWORDS = ('SOPClassUID', 'ImageType', 'Rows', 'Columns', 'NumberOfFrames', 'SamplesPerPixel', 'PhotometricInterpretation', 'BitsAllocated', 'BitsStored',
             'HighBit', 'PixelRepresentation', 'PixelIntensityRelationship', 'ModalityLUTSequence', 'DistanceSourceToDetector', 'DistanceSourceToPatient',
             'ImagerPixelSpacing', 'PositionerPrimaryAngle', 'PositionerSecondaryAngle', 'PositionerPrimaryAngleIncrement',
             'PositionerSecondaryAngleIncrement', 'PatientOrientation', 'FrameIncrementPointer', 'FrameTime', 'FrameTimeVector', 'CineRate',
-            'RecommendedDisplayFrameRate')
+            'RecommendedDisplayFrameRate', 'ExtendedOffsetTable', 'ExtendedOffsetTableLengths')
 TOWARDS = {'L': (1, 0, 0), 'R': (-1, 0, 0), 'P': (0, 1, 0), 'A': (0, -1, 0), 'H': (0, 0, 1), 'F': (0, 0, -1)}   # letters of PatientOrientation
 
 
 class BadDicom(ValueError):
     """A file that is no XA run that can be used; the message names it and tells why, without what else is in the file."""
+
+
+def one_line(text: str) -> str:
+    """The begin of what comes from a file, as it may be shown: control characters would command a terminal."""
+    return ''.join(c if c.isprintable() else '?' for c in ' '.join(text.split())[:200])
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ def read_run(path) -> XaRun:
     header = _header(path)
     count = int(_number(path, header, 'NumberOfFrames', 1, MAX_FRAMES, 1))
     _check_pixels(path, header, count)
-    plane = {'BIPLANE A': 'a', 'BIPLANE B': 'b'}.get(str((list(header.get('ImageType') or []) + [''] * 3)[2]).strip(), '')
+    plane = {'BIPLANE A': 'a', 'BIPLANE B': 'b'}.get((*_words(header, 'ImageType'), '', '', '')[2], '')
     return XaRun(path, plane, frame_times(path, header, count), calibrations(path, header, count), header)
 
 
@@ -68,6 +76,15 @@ def in_order(runs: list[XaRun]) -> list[XaRun]:
 # ---- header
 
 
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Makes whatever pydicom raises on a damaged file a BadDicom; nothing of ours belongs into the block, whose errors would be taken for the file's."""
+    try:
+        yield
+    except Exception as error:      # on a damaged file pydicom raises anything
+        raise BadDicom(f'{path}: damaged: {what} can\'t be read ({type(error).__name__})') from error
+
+
 def _header(path: Path):
     """pydicom's dataset of KEYWORDS. Raises BadDicom."""
     import pydicom
@@ -80,20 +97,20 @@ def _header(path: Path):
     with path.open('rb') as file:
         if file.read(132)[128:] != b'DICM':
             raise BadDicom(f'{path}: not a DICOM file')
-    what = 'its header'
-    try:
+    with reading(path, 'its header'):
         syntax = read_file_meta_info(path).TransferSyntaxUID
-        if syntax == DEFLATED:      # would be inflated as a whole, to whatever size
-            raise BadDicom(f'{path}: deflated as a whole; save it uncompressed first')
-        if syntax not in pydicom.uid.AllTransferSyntaxes:
-            raise BadDicom(f'{path}: written in a transfer syntax that is not known')
-        header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=[Tag(k) for k in KEYWORDS])
-        for what in KEYWORDS:       # noqa: B007 pydicom looks at a value when it is first asked for
-            header.get(what)
-    except (BadDicom, OSError):
-        raise
-    except Exception as error:  # the last line of defence: on a damaged file pydicom raises anything
-        raise BadDicom(f'{path}: damaged: {what} can\'t be read ({type(error).__name__})') from error
+    if syntax == DEFLATED:      # would be inflated as a whole, to whatever size
+        raise BadDicom(f'{path}: deflated as a whole; save it uncompressed first')
+    if syntax not in pydicom.uid.AllTransferSyntaxes:
+        raise BadDicom(f'{path}: written in a transfer syntax that is not known')
+    tags = [Tag(keyword) for keyword in KEYWORDS]
+    with reading(path, 'its header'):
+        header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
+    for keyword in KEYWORDS:
+        with reading(path, keyword):
+            value = header.get(keyword)     # pydicom looks at a value when it is first asked for
+        if isinstance(value, pydicom.Sequence) and keyword != 'ModalityLUTSequence':    # whose own values it has not looked at yet
+            raise BadDicom(f'{path}: damaged: {keyword} is a sequence')
     if str(header.get('SOPClassUID', '')) == ENHANCED_XA:
         raise BadDicom(f'{path}: an Enhanced XA image; only XA images are read')
     return header
@@ -122,6 +139,12 @@ def _numbers(path: Path, header, keyword: str) -> list[float]:
     return values
 
 
+def _words(header, keyword: str) -> list[str]:
+    """The values of an attribute as texts; none where it is missing."""
+    value = header.get(keyword)
+    return [] if value is None else [str(v).strip() for v in np.atleast_1d(np.array(value, object))]
+
+
 def _check_pixels(path: Path, header, count: int) -> None:
     """Raises BadDicom for pixels that can't be read, before any memory is taken for them."""
     from pydicom.pixels import get_decoder
@@ -131,11 +154,11 @@ def _check_pixels(path: Path, header, count: int) -> None:
     stored = int(_number(path, header, 'BitsStored', 1, allocated, allocated))
     high = int(_number(path, header, 'HighBit', stored - 1, allocated - 1, stored - 1))
     if allocated not in (8, 16) or _number(path, header, 'SamplesPerPixel', 1, 4, 1) != 1 or kind not in ('MONOCHROME1', 'MONOCHROME2'):
-        raise BadDicom(f'{path}: only grey pixels of 8 or 16 bits are read, not {kind or "unknown ones"} of {allocated} ({stored} stored, the highest is {high})')
-    syntax, size = header.file_meta.TransferSyntaxUID, path.stat().st_size
+        raise BadDicom(f'{path}: only grey pixels of 8 or 16 bits are read, not {one_line(kind)[:16] or "unknown ones"} of {allocated} ({stored} stored, the highest is {high})')
+    syntax, size, needed = header.file_meta.TransferSyntaxUID, path.stat().st_size, rows * columns * count * allocated // 8
     if not syntax.is_encapsulated:
-        if rows * columns * count * allocated // 8 > size:
-            raise BadDicom(f'{path}: truncated: {count} frames of {columns}x{rows} px need {rows * columns * count * allocated // 8} bytes, the file has {size}')
+        if needed > size:
+            raise BadDicom(f'{path}: truncated: {count} frames of {columns}x{rows} px need {needed} bytes, the file has {size}')
         return
     try:
         decoder = get_decoder(syntax)
@@ -146,6 +169,8 @@ def _check_pixels(path: Path, header, count: int) -> None:
         raise BadDicom(f'{path}: compressed as {syntax.name}, which can\'t be decoded here: it needs one of {missing}')
     if 8 * count > size:
         raise BadDicom(f'{path}: truncated: {count} compressed frames in {size} bytes')
+    if needed > MAX_RATIO * size:
+        raise BadDicom(f'{path}: {count} frames of {columns}x{rows} px are more than {MAX_RATIO} times as large as the file')
 
 
 # ---- time and geometry
@@ -154,7 +179,7 @@ def _check_pixels(path: Path, header, count: int) -> None:
 def frame_times(path: Path, header, count: int) -> np.ndarray | None:
     """(N,) ns from the first frame on, as FrameIncrementPointer says or whatever else tells; None where nothing does. Raises BadDicom."""
     vector, step = _numbers(path, header, 'FrameTimeVector'), _numbers(path, header, 'FrameTime')
-    if vector and step and int(header.get('FrameIncrementPointer') or 0) == 0x00181063:
+    if vector and step and header.get('FrameIncrementPointer') == 0x00181063:
         vector = []
     if vector:
         if len(vector) != count or min(vector[1:], default=1.0) <= 0:
@@ -195,8 +220,7 @@ def _calibration(path: Path, header, angles: np.ndarray, sid: float, sod: float,
     width, height = int(header.Columns), int(header.Rows)
     R = camera_from_patient(*angles)
     signs = [-1.0, 1.0]         # u and v of the image against those that the source sees
-    letters = [str(word).strip()[:1] for word in (header.get('PatientOrientation') or [])]
-    for k, letter in enumerate(letters[:2]):
+    for k, letter in enumerate(word[:1] for word in _words(header, 'PatientOrientation')[:2]):
         signs[k] *= -1.0 if letter in TOWARDS and signs[k] * R[k] @ TOWARDS[letter] < 0 else 1.0
     K = np.array([[signs[0] * sid / spacing[1] * 1e3, 0.0, (width - 1) / 2], [0.0, signs[1] * sid / spacing[0] * 1e3, (height - 1) / 2], [0.0, 0.0, 1.0]])
     return Calibration('', width, height, K, K @ np.c_[R, [0.0, 0.0, sod]], 'plumb_bob', np.zeros(5))

@@ -8,15 +8,11 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path
 from rcl_interfaces.srv import SetParameters
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -28,17 +24,20 @@ from msg_adapters.messages import header, ros_message
 from ..data import Outcome
 from ..sim.publisher import PLANES, calibration, optical_frame
 from ..sim.scenes import Scene, ping_pong
+from .own_node import OwnNode
 
 IMAGE_DEPTH = 5
 CALL_EVERY_S = 0.25
 ON_DEMAND = {'backbone_points': PointCloud2, 'markers': MarkerArray, 'plane_a/overlay': Image, 'plane_b/overlay': Image}
 
 
-class Probe:
+class Probe(OwnNode):
     """A context manager with a ROS context of its own, used by one thread: what comes is heard while it spins or streams.
 
     `scenes` are played forth and back. Times are those of time.monotonic().
     """
+
+    NAME = 'fluoro_shape_probe'
 
     def __init__(self, scenes: Sequence[Scene]):
         self.sent: dict[int, float] = {}            # stamp_ns to when the second image was handed to the middleware
@@ -48,12 +47,8 @@ class Probe:
         self.reports: list[tuple[float, dict[str, int]]] = []   # when diagnostics came, and what the node had counted
         self._scenes = scenes
 
-    def __enter__(self) -> Probe:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = node = rclpy.create_node('fluoro_shape_probe', context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(node)
+    def _connect(self) -> None:
+        node = self._node
         images = QoSProfile(depth=IMAGE_DEPTH)
         self._images = [node.create_publisher(Image, f'plane_{p}/image_raw', images) for p in PLANES]
         self._infos = [node.create_publisher(CameraInfo, f'plane_{p}/camera_info', images) for p in PLANES]
@@ -65,12 +60,6 @@ class Probe:
         self._next_call = itertools.cycle(self._services)
         self._pairs = ping_pong([(scene, self._messages(scene)) for scene in self._scenes])
         self._tips: dict[int, np.ndarray] = {}      # of what is under way
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
 
     def listen_to_everything(self) -> None:
         """Subscribe to what the node computes on demand; what comes is not even deserialised."""

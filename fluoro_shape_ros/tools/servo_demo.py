@@ -29,26 +29,20 @@ def _parser() -> argparse.ArgumentParser:
                     'true tip, the delay of the loop, and by how much the robot misses the targets without it.')
     add = parser.add_argument
     add('--robot', choices=tuple(ROBOTS), default='two_tubes', help='concentric tubes, or a segment bent by tendons')
-    add('--runs', type=_count, default=1, metavar='N', help='each with a robot, a load and targets of its own')
+    add('--runs', type=cli.count, default=1, metavar='N', help='each with a robot, a load and targets of its own')
     add('--seed', type=int, default=0, help='of the first run; they count up')
-    add('--targets', type=_count, default=3, metavar='N', help='of each run')
+    add('--targets', type=cli.count, default=3, metavar='N', help='of each run')
     add('--square', type=float, default=0.012, metavar='M', help='side of the square, m; 0: none')
     add('--blackout', action='store_true', help='halfway along the square, plane B does not show the device for 1 s')
-    add('--rate', type=_positive, default=15.0, metavar='HZ', help='pairs a second')
-    add('--size', type=_count, default=512, metavar='PX', help='of the images, which always show 154 mm')
+    add('--rate', type=_rate, default=15.0, metavar='HZ', help='pairs a second')
+    add('--size', type=cli.count, default=512, metavar='PX', help='of the images, which always show 154 mm')
     add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine')
     add('--out', type=Path, default=Path('fluoro_shape_servo_demo'), metavar='FOLDER', help='the picture and logs go there')
     add('--domain', type=int, default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     return parser
 
 
-def _count(text: str) -> int:
-    if (number := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f'{text}: at least one is needed')
-    return number
-
-
-def _positive(text: str) -> float:
+def _rate(text: str) -> float:
     value = float(text)
     if not 0 < value < 1e3:
         raise argparse.ArgumentTypeError(f'{text} is no rate')

@@ -6,17 +6,14 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-import rclpy
 from geometry_msgs.msg import PointStamped
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from msg_adapters.messages import header, ros_message, stamp_ns
 
 from ..sim.scenes import FRAME_ID
+from .own_node import OwnNode
 
 
 @dataclass
@@ -35,35 +32,22 @@ class Record:
         return float(np.linalg.norm(self.true[stamp] - self.target[stamp]))
 
 
-class Referee:
+class Referee(OwnNode):
     """A context manager with a ROS context of its own; `record` fills while it spins. `now` is the robot's clock."""
+
+    NAME = 'servo_referee'
 
     def __init__(self):
         self.record, self.now = Record(), None
         self.target: np.ndarray | None = None
         self._left: dict[int, float] = {}       # when the truth of a pair was heard, just before its images
 
-    def __enter__(self) -> Referee:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node('servo_referee', context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+    def _connect(self) -> None:
         self._targets = self._node.create_publisher(PointStamped, 'target', 1)
         self._blackout = self._node.create_client(Trigger, 'blackout')
         for kind, topic, callback in ((PointStamped, 'ground_truth/tip', self._on_truth), (PointStamped, 'tip', self._on_tip),
                                       (JointState, 'joint_states', self._on_joints), (JointState, 'joint_command', self._on_command)):
             self._node.create_subscription(kind, topic, callback, 10)
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
-
-    def spin(self, seconds: float) -> None:
-        """Serve what has come, or wait for something to come for at most `seconds`."""
-        self._executor.spin_once(timeout_sec=seconds)
 
     def black_out(self) -> None:
         """Ask the robot for a blackout; `record.blackout` says when, once it has answered."""

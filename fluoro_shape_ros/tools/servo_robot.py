@@ -8,11 +8,7 @@ import sys
 import time
 
 import numpy as np
-import rclpy
 from nav_msgs.msg import Path
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -25,6 +21,7 @@ from ..sim.kinematics import driven
 from ..sim.publisher import FluoroSim, true_shape, use_large_image_profile
 from ..sim.scenes import FRAME_ID, Scene
 from . import cli
+from .own_node import OwnNode
 
 CONNECT_S = 120.0       # for everybody to find each other
 PATIENCE_S = 2.0        # for the answer to a pair, by the wall's clock
@@ -32,7 +29,7 @@ BLACKOUT_S = 1.0        # of a blackout, by the robot's clock
 BLIND = 1               # the plane that a blackout takes the device from
 
 
-class Robot:
+class Robot(OwnNode):
     """Joints and X-ray system with a clock of their own, as a context manager.
 
     The clock goes on by a pair time a pair: as fast as the wall's, but no pair goes out before the one before the last has been answered. So a
@@ -40,28 +37,19 @@ class Robot:
     a plane for BLACKOUT_S; its message are the stamps (ns) between which.
     """
 
+    NAME = 'servo_robot'
+
     def __init__(self, name: str, rate: float, what: plant.Plant):
         self._name, self._period, self._plant = name, 1 / rate, what
         self._joints = self._command = plant.ROBOTS[name].start
         self._index, self._answered, self._stamps, self._dark = 0, 0, [time.time_ns()], (0, 0)
 
-    def __enter__(self) -> Robot:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node('servo_robot', context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+    def _connect(self) -> None:
         self._states = self._node.create_publisher(JointState, 'joint_states', 10)
         self._predictions = self._node.create_publisher(Path, 'predicted_backbone', 10)
         self._node.create_subscription(JointState, 'joint_command', self._on_command, 1)
         self._node.create_subscription(MarkerArray, 'markers', self._on_markers, 10)     # they come for every pair, rejected or not
         self._node.create_service(Trigger, 'blackout', self._on_blackout)
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
 
     def run(self, xray: FluoroSim) -> None:
         """Publish joints, prediction and a pair again and again; ends with a signal."""

@@ -44,44 +44,30 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'must be positive: {text}')
-    return value
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'must not be negative: {text}')
-    return value
-
-
 # name, help, and what argparse needs to know
 _STREAM = (
-    ('--rate', 'pairs a second', dict(type=_positive, default=15.0, metavar='HZ')),
-    ('--frames', 'end after N pairs (default: never)', dict(type=_count, metavar='N')),
-    ('--wait', 'publish only once somebody listens to all images and camera infos; give up after S seconds', dict(type=_positive, metavar='S')),
+    ('--rate', 'pairs a second', dict(type=cli.positive, default=15.0, metavar='HZ')),
+    ('--frames', 'end after N pairs (default: never)', dict(type=cli.natural, metavar='N')),
+    ('--wait', 'publish only once somebody listens to all images and camera infos; give up after S seconds', dict(type=cli.positive, metavar='S')),
     ('--prerender', f'render N pairs first, play them forth and back; 0: render while publishing (default: {STILL_FRAMES}, moving {MOVING_FRAMES})',
-     dict(type=_count, metavar='N')),
+     dict(type=cli.natural, metavar='N')),
     ('--reliability', 'of images and camera infos', dict(choices=('reliable', 'best_effort'), default='reliable')),
     ('--reference-frame', 'frame of the ground truth; give the node\'s reference_frame the same name', dict(default=scenes.FRAME_ID, metavar='NAME')),
 )
 _DEVICE = (
-    ('--seed', 'the same seed and options give the same images', dict(type=_count, default=0)),
+    ('--seed', 'the same seed and options give the same images', dict(type=cli.natural, default=0)),
     ('--shape', 'random smooth spline, or two-tube active cannula', dict(choices=tuple(KINDS), default='spline')),
     ('--moving', 'the device slides and bends', dict(action='store_true')),
-    ('--length', 'range of its length, m (default 0.067 0.188)', dict(type=_positive, nargs=2, default=scenes.LENGTHS, metavar=('MIN', 'MAX'))),
-    ('--radius', 'm', dict(type=_positive, default=scenes.RADIUS, metavar='M')),
+    ('--length', 'range of its length, m (default 0.067 0.188)', dict(type=cli.positive, nargs=2, default=scenes.LENGTHS, metavar=('MIN', 'MAX'))),
+    ('--radius', 'm', dict(type=cli.positive, default=scenes.RADIUS, metavar='M')),
     ('--entering', 'the shaft comes in through the border of both images', dict(action='store_true')),
 )
 _IMAGES = (
     ('--renderer', 'X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011',
      dict(choices=scenes.RENDERERS, default='xray')),
     ('--depth', 'bits a pixel; above 8 the images are mono16; xray only', dict(type=int, choices=(8, 10, 12, 14, 16), default=8)),
-    ('--photons', 'detected a pixel in the open beam: the fewer, the noisier; xray only', dict(type=_positive, default=1500.0)),
-    ('--contrast', 'share of the beam that the device takes away; xray only', dict(type=_positive, default=0.25)),
+    ('--photons', 'detected a pixel in the open beam: the fewer, the noisier; xray only', dict(type=cli.positive, default=1500.0)),
+    ('--contrast', 'share of the beam that the device takes away; xray only', dict(type=cli.positive, default=0.25)),
     ('--no-anatomy', 'an even background; xray only', dict(action='store_true')),
     ('--clutter', 'what else is in the field; xray only', dict(nargs='+', choices=scenes.CLUTTER, default=())),
 )
@@ -89,10 +75,10 @@ _GEOMETRY = (
     ('--angle-a', 'of plane A, degrees, LAO and cranial are positive (default 0 0)',
      dict(type=float, nargs=2, default=(0.0, 0.0), metavar=('PRIMARY', 'SECONDARY'))),
     ('--angle-b', 'of plane B, degrees (default 90 0)', dict(type=float, nargs=2, default=(90.0, 0.0), metavar=('PRIMARY', 'SECONDARY'))),
-    ('--sid', 'source to detector, m', dict(type=_positive, default=1.195, metavar='M')),
-    ('--sod', 'source to isocentre, m', dict(type=_positive, default=0.81, metavar='M')),
-    ('--pixel-size', 'at the detector, m (default: what is 0.3 mm at the isocentre for xray, 0.523 mm for vtk)', dict(type=_positive, metavar='M')),
-    ('--size', 'of the images, px (default 1024 1024)', dict(type=_count, nargs=2, default=(1024, 1024), metavar=('WIDTH', 'HEIGHT'))),
+    ('--sid', 'source to detector, m', dict(type=cli.positive, default=1.195, metavar='M')),
+    ('--sod', 'source to isocentre, m', dict(type=cli.positive, default=0.81, metavar='M')),
+    ('--pixel-size', 'at the detector, m (default: what is 0.3 mm at the isocentre for xray, 0.523 mm for vtk)', dict(type=cli.positive, metavar='M')),
+    ('--size', 'of the images, px (default 1024 1024)', dict(type=cli.natural, nargs=2, default=(1024, 1024), metavar=('WIDTH', 'HEIGHT'))),
 )
 
 

@@ -5,12 +5,8 @@ from __future__ import annotations
 import time
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 from msg_adapters.cameras import camera_info_to_view
@@ -20,14 +16,17 @@ from msg_adapters.messages import stamp_ns
 from msg_adapters.shapes import path_to_points
 
 from ..data import Outcome
+from .own_node import OwnNode
 from .pictures import Snapshot
 from .score import Score
 
 KEPT = 40   # stamps of which parts of a snapshot are kept
 
 
-class Watcher:
+class Watcher(OwnNode):
     """A context manager with a ROS context of its own; `score` and what the node says of itself fill while it spins."""
+
+    NAME = 'fluoro_shape_demo'
 
     def __init__(self):
         self.score = Score()
@@ -36,25 +35,10 @@ class Watcher:
         self.snapshot: Snapshot | None = None
         self._parts: dict[int, dict] | None = None  # of snapshots, by stamp
 
-    def __enter__(self) -> Watcher:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node('fluoro_shape_demo', context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+    def _connect(self) -> None:
         self._node.create_subscription(Path, 'ground_truth/backbone', self._on_truth, 10)
         self._node.create_subscription(Path, 'backbone', self._on_backbone, 10)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
-
-    def spin(self, seconds: float) -> None:
-        """Serve what has come, or wait for something to come for at most `seconds`."""
-        self._executor.spin_once(timeout_sec=seconds)
 
     def watch_images(self) -> None:
         """From now on take a snapshot of the first pair whose images, cameras, truth and result have all come."""
