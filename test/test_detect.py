@@ -7,10 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
+from fluoro_shape_ros.chains import Candidate
+from fluoro_shape_ros.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Outcome
-from fluoro_shape_ros.detect import candidates_of, detect, evidence, explained, track
+from fluoro_shape_ros.detect import candidates_of, detect, explained, track
 from fluoro_shape_ros.field import field_of_view
 from fluoro_shape_ros.geometry import project
+from fluoro_shape_ros.plausibility import evidence
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 
@@ -90,6 +93,26 @@ def test_lines_that_share_no_epipolar_lines_do_not_correspond():
     rolled = np.roll(plain.images[1], 230, axis=0)      # the device stands nearly half the image lower there
     result = detect(*prepared(replace(plain, images=(plain.images[0], rolled))), RADIUS, MIN_LENGTH)
     assert result.outcome is not Outcome.OK and result.fit is None
+
+
+def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, monkeypatch):
+    def mixed(image, field, *rest):
+        """In plane a the device; in plane b its first half, going on straight as a lead might."""
+        k = next(k for k, i in enumerate(images) if i is image)
+        line = project(VIEWS[k].P, scene.truth)
+        if k == 1:
+            half = len(line) // 2
+            step = line[half] - line[half - 1]
+            line = np.concatenate([line[:half], line[half] + np.arange(len(line) - half)[:, None] * (step + np.linalg.norm(step) * np.array([0.5, 0]))])
+        line = at_arc_length(line, np.arange(0, arc_length(line)[-1]))
+        return [Candidate(line, np.ones(len(line)), 0.9)]
+
+    images, fields, views = prepared(scene.frame)
+    monkeypatch.setattr('fluoro_shape_ros.detect.candidates_of', mixed)
+    result = detect(images, fields, views, RADIUS, MIN_LENGTH)
+    assert result.outcome is Outcome.OK and mean_off(result.fit, scene.truth) < 0.08e-3
+    ends = result.fit.spline(np.array([result.fit.start, result.fit.stop]))
+    assert cKDTree(ends).query(scene.truth[[0, -1]])[0].max() < 0.4e-3
 
 
 def test_tracking_goes_on_from_where_the_device_was(scene, found):
