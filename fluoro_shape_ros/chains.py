@@ -14,7 +14,7 @@ GAP_PX = 48.0           # longest gap that is bridged, where it is straight ...
 MAX_TURN = np.deg2rad(50)    # ... the direction may change by this over a short gap
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A chain of branches that may be the device."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,24 +11,29 @@ from scipy.spatial import cKDTree
 from .centerline import find_ridges, ridge_scale, shrinking
 from .chains import Candidate, find_candidates
 from .data import Outcome
-from .fit import Fit, contrast_ratio, fit, shown
+from .fit import COARSE, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
+from .plausibility import alike_device, blunt, doubt, evidence
 from .start import first_curve
 from .strips import apparent_width, cut_along, half_width_range, likeness, odd_width, pieces
+from .sweep import darkness, sweep
 
 LINES = 14              # strongest lines of an image that are looked at closely
 CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...
 HOPELESS = 0.03         # ... unless they are that much less like it than the best
 HYPOTHESES = 4          # alignments that are fitted before one is chosen
-CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
-UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
-ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less likely the device
+AGAIN = 2               # where the best is in doubt: how many of them are fitted again ...
+SWEPT = 2               # ... and how many lines of either plane are looked for in the other ...
+SEEN = 0.6              # ... which must show this share of the line
+FLIPPED = 0.7           # alignment of a pair of lines read the other way round, as a share of the better way's, that must be looked at, too ...
+RIVAL, APART = 0.7, 5e-3        # ... and the weight of a curve that far from the chosen one, m, as a share of its weight, that makes it a rival ...
+SHARPER = 3.5           # ... unless the ends of one are clearer by this, as the planes agree on them
 EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
-CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it
+CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it ...
+PROMISING = 0.08        # ... and that makes another try worth while
 ASIDE = 0.8             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
-NO_TIP = 0.2            # what is left of a line that leaves the field at both ends: it has no tip to show
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,32 @@ class Detection:
     seen_px: tuple[np.ndarray | None, np.ndarray | None]    # (N, 2) image pixels as received
 
 
+Lines = tuple[Candidate | None, Candidate | None]       # of planes a and b; None where the line there is not the device's
+Start = tuple[np.ndarray, Lines, int]   # (M, 3) m of a first curve, the lines that say so, and how often the fit searches around it
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A fit that is tried, and what speaks for it."""
+
+    fit: Fit
+    share: float            # of the lines it comes from that it explains
+    lines: Lines
+    start: np.ndarray       # (M, 3) m
+
+    @property
+    def weight(self) -> float:
+        return self.share * evidence(self.fit)
+
+    @property
+    def convincing(self) -> bool:
+        return self.weight > CONVINCING * np.sqrt(self.fit.stop - self.fit.start)
+
+    @property
+    def promising(self) -> bool:
+        return self.weight > PROMISING * np.sqrt(self.fit.stop - self.fit.start)
+
+
 def detect(images, fields, views, radius: float, min_length_px: float) -> Detection:
     """Search both whole images (H, W float32, dark device) for the device of `radius` m."""
     center = isocenter(views)[None]
@@ -49,34 +81,92 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if not found:
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
+
+    def attempts(starts, times: int) -> Iterator[Attempt]:
+        """Fits, each as often again from where it came to lie: a start some px off may catch on another line where the next does not."""
+        for points, lines, coarse in starts:
+            for _ in range(times):
+                fitted = fit(images, fields, views, points, radius, coarse)
+                if fitted is None:
+                    break
+                share = min(explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None)
+                attempt = Attempt(fitted, share, lines, points)
+                yield attempt
+                if not attempt.promising:
+                    break
+                points = _curve(fitted)
+
+    tried, settled = [], None
+    for attempt in attempts((start for start in _pairs(views, candidates) if settled is None or start[1] == settled.lines), 1):
+        tried.append(attempt)
+        if settled is None and attempt.convincing and not doubt(attempt.fit, min_length_px):
+            settled = attempt       # but for the same lines read the other way round
+    if not tried:
+        return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
+    chosen = max(tried, key=lambda t: t.weight)
+    if not chosen.convincing or doubt(chosen.fit, min_length_px):       # who tries often must ask for more: clear ends too
+        more = attempts(_again(images, fields, views, candidates, widths, tried), 2)
+        chosen = next((t for t in more if t.convincing and not blunt(t.fit).any() and not doubt(t.fit, min_length_px)), chosen)
+    others = [t for t in tried if t.weight > RIVAL * chosen.weight and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
+    if others:      # lines along epipolar lines: only the ends tell which way round they belong together
+        chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
+        if second.fit.end_sigma.max() < SHARPER * chosen.fit.end_sigma.max():
+            return Detection(None, Outcome.NO_CORRESPONDENCE, 'two curves in space explain the same lines alike: they run along epipolar lines', best)
+    seen = tuple(_projected(chosen.fit, v) if c is None else c.points_px for v, c in zip(views, chosen.lines))
+    if chosen.share < MIN_EXPLAINED:
+        return Detection(None, Outcome.POORLY_EXPLAINED, f'only {100 * chosen.share:.0f} % of the line seen in one plane are explained', seen)
+    return Detection(chosen.fit, Outcome.OK, 'ok', seen)
+
+
+def _pairs(views, candidates) -> Iterator[Start]:
+    """Where the device may be by a line of each plane, most likely first; the same lines in the other direction only where that fits about as well."""
     curves = [[undistort(v, c.points_px) for c in found] for v, found in zip(views, candidates)]
     F = fundamental(views[0].P, views[1].P)
-    fits = []
+    scores = {}
     for alignment in align(*curves, [np.array([c.score for c in found]) for found in candidates], F, best=HYPOTHESES):
-        start = first_curve(views, curves[0][alignment.a], curves[1][alignment.b], alignment)
-        fitted = fit(images, fields, views, start, radius)
-        if fitted is not None:
-            lines = curves[0][alignment.a], curves[1][alignment.b]
-            taken = candidates[0][alignment.a], candidates[1][alignment.b]
-            share = min(explained(fitted, v, line, c.z > 0) for v, line, c in zip(views, lines, taken))
-            fits.append((share * evidence(fitted), fitted, share, tuple(c.points_px for c in taken)))
-            if fits[-1][0] > CONVINCING * np.sqrt(fitted.stop - fitted.start):
-                break
-    if not fits:
-        return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
-    _, fitted, share, seen = max(fits, key=lambda f: f[0])
-    if share < MIN_EXPLAINED:
-        return Detection(None, Outcome.POORLY_EXPLAINED, f'only {100 * share:.0f} % of the line seen in one plane are explained', seen)
-    return Detection(fitted, Outcome.OK, 'ok', seen)
+        a, b = alignment.a, alignment.b
+        if alignment.score < FLIPPED * scores.setdefault((a, b), alignment.score):
+            continue
+        yield first_curve(views, curves[0][a], curves[1][b], alignment), (candidates[0][a], candidates[1][b]), 0
 
 
-def track(images, fields, views, radius: float, points: np.ndarray) -> Detection | None:
-    """Fit from where the device was, (N, 3) m; None where it is no longer there, so that the whole images must be searched."""
+def _again(images, fields, views, candidates, widths, tried: list[Attempt]) -> Iterator[Start]:
+    """Where else it may be, when no pair of lines settled it: where the likeliest fits came to lie; where the other plane shows what one plane's line
+    alone says; and the likeliest again with a search around their starts."""
+    likeliest = sorted((t for t in tried if t.promising), key=lambda t: -t.weight)[:AGAIN]
+    yield from ((_curve(attempt.fit), attempt.lines, 0) for attempt in likeliest)
+    dark = [darkness(*plane) for plane in zip(images, fields, widths)]
+    paths = []
+    for k, (view, found) in enumerate(zip(views, candidates)):
+        for c in found[:SWEPT]:
+            path = sweep(undistort(view, c.points_px), (view, views[1 - k]), (dark[k], dark[1 - k]))
+            if path is not None and path.share > SEEN:
+                paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (c, None)[::1 - 2 * k]))
+    yield from ((points, lines, 0) for _, points, lines in sorted(paths, key=lambda p: -p[0]))
+    yield from ((attempt.start, attempt.lines, COARSE) for attempt in likeliest)
+
+
+def _curve(f: Fit) -> np.ndarray:
+    """(200, 3) m along the fitted device."""
+    return f.spline(np.linspace(f.start, f.stop, 200))
+
+
+def _apart(f: Fit, g: Fit) -> float:
+    """m by which a fitted curve leaves another at most."""
+    return float(cKDTree(_curve(f)).query(_curve(g))[0].max())
+
+
+def _projected(f: Fit, view) -> np.ndarray:
+    """(100, 2) image pixels as received, along the fitted device."""
+    return distort(view, project(view.P, f.spline(np.linspace(f.start, f.stop, 100))))
+
+
+def track(images, fields, views, radius: float, min_length_px: float, points: np.ndarray) -> Detection | None:
+    """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
     fitted = fit(images, fields, views, points, radius, coarse=1)
-    if fitted is None or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or fitted.aside.max() > ASIDE:
+    if fitted is None or fitted.aside.max() > ASIDE or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
         return None
-    ends = np.linspace(fitted.start, fitted.stop, 100)
-    return Detection(fitted, Outcome.OK, 'ok', tuple(distort(v, project(v.P, fitted.spline(ends))) for v in views))
+    return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in views))
 
 
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:
@@ -107,18 +197,3 @@ def explained(f: Fit, view, line_px: np.ndarray, visible: np.ndarray) -> float:
     share = np.bincount(piece, near) / np.bincount(piece)
     counted = (share[piece] > 0.2) & ~elsewhere
     return float(near[counted].mean()) if counted.any() else 0.0
-
-
-def evidence(f: Fit) -> float:
-    """How much speaks for a fit: a device looks like a cylinder of about its radius, is seen all along and equally dark by both planes, and stops in both at once."""
-    if f.contrast.min() <= 0:
-        return 0.0
-    alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
-    goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
-    closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness))
-
-
-def alike_device(odd: float, likeness: np.ndarray) -> float:
-    """At most 1: how device-like lines are, by their odd width and their (V,) likeness with cylinders of their own width."""
-    return float(np.exp((np.clip(likeness, 0, 1).mean() - 1) / UNLIKE - 0.5 * (odd / ODD_WIDTH) ** 2))

@@ -15,7 +15,6 @@ from .curve import arc_length, middle
 from .detect import Detection, track
 from .fit import Fit
 from .geometry import pixels_per_metre
-from .plausibility import check_fit
 from .prior import Guess, borne_out, in_image, whole
 from .solver import Layout, solve
 from .spline import through
@@ -42,13 +41,13 @@ def found_near(images, fields, views, config: Config, guess: Guess) -> Detection
     start = follow(images, fields, views, guess, config.detection.robot_radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = track(images, fields, views, config.detection.robot_radius, start)
+    found = track(images, fields, views, config.detection.robot_radius, config.detection.min_length_px, start)
     if found is None:
         return None
     f = found.fit
     points = curve(f)
     sharp = (f.open_end | (f.end_sigma < SHARP)).all()
-    believed = sharp and whole(f.stop - f.start, guess, views) and borne_out(points, guess) and not check_fit(f, config)
+    believed = sharp and whole(f.stop - f.start, guess, views) and borne_out(points, guess)
     return found if believed else None
 
 

@@ -50,7 +50,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     found = None
     if config.curve.tracking and prior.previous is not None:
         around = [region_around(v, prior.previous.points) for v in frame.views]
-        found = _near(around, track, images, fields, frame.views, polarity, radius, prior.previous.points)
+        found = _near(around, track, images, fields, frame.views, polarity, radius, config.detection.min_length_px, prior.previous.points)
         clock.lap('track')
     if guess is not None and (found is None or not borne_out(curve(found.fit), guess)):
         around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]

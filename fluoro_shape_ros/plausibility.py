@@ -7,7 +7,6 @@ import numpy as np
 from .config import Config
 from .curve import curvature, middle
 from .data import Outcome
-from .detect import evidence
 from .fit import Fit, contrast_ratio, ends_shown, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
@@ -20,14 +19,46 @@ MIN_BEYOND = -0.25      # darkness past an end, in both planes: what is brighter
 MAX_ASIDE = 0.7         # darkness, in both planes, of a line beside where an end would go on
 MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane
 MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
+BLUNT, BLUNT_PX = 0.35e-3, 1.2          # the same, from which on an end is not clear: then a line beside it by MAX_ASIDE in one plane may be the device's ...
+BARE = 0.05             # ... unless straight on it is at least so dark there
 MIN_CONTRAST = 0.02
-MIN_EVIDENCE = 0.4      # see detect.evidence, for a length of 1 m
+MIN_EVIDENCE = 0.4      # see `evidence`, for a length of 1 m
+CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
+UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
+ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less likely the device
+NO_TIP = 0.2            # what is left of a line that leaves the field at both ends: it has no tip to show
+
+
+def evidence(f: Fit) -> float:
+    """How much speaks for a fit: a device looks like a cylinder of about its radius, is seen all along and equally dark by both planes, and stops in both at once."""
+    if f.contrast.min() <= 0:
+        return 0.0
+    alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
+    goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
+    closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
+    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness))
+
+
+def alike_device(odd: float, likeness: np.ndarray) -> float:
+    """At most 1: how device-like lines are, by their odd width and their (V,) likeness with cylinders of their own width."""
+    return float(np.exp((np.clip(likeness, 0, 1).mean() - 1) / UNLIKE - 0.5 * (odd / ODD_WIDTH) ** 2))
+
+
+def blunt(f: Fit) -> np.ndarray:
+    """(2,) bool: whether the images show the first and the last end, but not clearly where it is."""
+    return ~f.open_end & (f.end_sigma > max(BLUNT, BLUNT_PX * (f.s[1] - f.s[0])))
 
 
 def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
     """Whether what both planes show along a fitted curve is one device: None, or the rejection."""
-    length_px = (f.stop - f.start) / (f.s[1] - f.s[0])
-    if length_px < config.detection.min_length_px:
+    return doubt(f, config.detection.min_length_px)
+
+
+def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
+    """The same of a device of at least `min_length_px`."""
+    px = f.s[1] - f.s[0]    # m
+    length_px = (f.stop - f.start) / px
+    if length_px < min_length_px:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
     if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
         return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
@@ -43,10 +74,12 @@ def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
     end_shown = ends_shown(f).min(axis=1)
     for k, name in enumerate(('first', 'last')):
-        if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * (f.s[1] - f.s[0]))):
+        if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * px)):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
         if not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE):
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
+        if blunt(f)[k] and ((f.aside[k] > MAX_ASIDE) & (f.beyond[k] < BARE)).any():
+            return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'
         if end_shown[k] < MIN_END_SHOWN:
             return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
     if all(f.open_end):

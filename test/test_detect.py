@@ -7,12 +7,18 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
+from fluoro_shape_ros.chains import Candidate
+from fluoro_shape_ros.curve import arc_length, at_arc_length
+from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
-from fluoro_shape_ros.detect import candidates_of, detect, evidence, explained, track
+from fluoro_shape_ros.detect import candidates_of, detect, explained, track
 from fluoro_shape_ros.field import field_of_view
 from fluoro_shape_ros.geometry import project
+from fluoro_shape_ros.plausibility import evidence
+from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.tools.families import families
 
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
 RADIUS, HALF_WIDTH = 0.0006, 2.0        # m, and px of it
@@ -92,16 +98,36 @@ def test_lines_that_share_no_epipolar_lines_do_not_correspond():
     assert result.outcome is not Outcome.OK and result.fit is None
 
 
+def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, monkeypatch):
+    def mixed(image, field, *rest):
+        """In plane a the device; in plane b its first half, going on straight as a lead might."""
+        k = next(k for k, i in enumerate(images) if i is image)
+        line = project(VIEWS[k].P, scene.truth)
+        if k == 1:
+            half = len(line) // 2
+            step = line[half] - line[half - 1]
+            line = np.concatenate([line[:half], line[half] + np.arange(len(line) - half)[:, None] * (step + np.linalg.norm(step) * np.array([0.5, 0]))])
+        line = at_arc_length(line, np.arange(0, arc_length(line)[-1]))
+        return [Candidate(line, np.ones(len(line)), 0.9)]
+
+    images, fields, views = prepared(scene.frame)
+    monkeypatch.setattr('fluoro_shape_ros.detect.candidates_of', mixed)
+    result = detect(images, fields, views, RADIUS, MIN_LENGTH)
+    assert result.outcome is Outcome.OK and mean_off(result.fit, scene.truth) < 0.08e-3
+    ends = result.fit.spline(np.array([result.fit.start, result.fit.stop]))
+    assert cKDTree(ends).query(scene.truth[[0, -1]])[0].max() < 0.4e-3
+
+
 def test_tracking_goes_on_from_where_the_device_was(scene, found):
-    tracked = track(*prepared(scene.frame), RADIUS, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
+    tracked = track(*prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
     assert tracked.outcome is Outcome.OK and mean_off(tracked.fit, scene.truth) < 0.08e-3
     for seen, before in zip(tracked.seen_px, found.seen_px):
         assert np.median(cKDTree(before).query(seen)[0]) < 1.5
 
 
 def test_tracking_gives_up_where_the_device_is_not(run, scene):
-    assert track(*prepared(run.without_device()), RADIUS, scene.truth) is None
-    assert track(*prepared(scene.frame), RADIUS, scene.truth + [0.02, 0.0, 0.0]) is None
+    assert track(*prepared(run.without_device()), RADIUS, 60.0, scene.truth) is None
+    assert track(*prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.02, 0.0, 0.0]) is None
 
 
 def test_explained_is_the_share_of_the_line_near_the_curve(scene, found):
@@ -126,3 +152,14 @@ def test_evidence_counts_what_makes_a_device(found):
     assert evidence(replace(f, contrast=f.contrast * [1, -1])) == 0
     half = replace(f, stop=(f.start + f.stop) / 2)
     assert_allclose(evidence(half), full * np.sqrt(0.5), rtol=0.05)
+
+
+@pytest.mark.parametrize('seed, told', [(10018, True), (10027, False)])
+def test_lines_along_epipolar_lines_fit_both_ways_round_and_only_clear_ends_tell(seed, told):
+    case = families()['tangent'].make(seed)
+    scene = case.scene
+    answer = reconstruct(scene.frame, Config.from_values(robot_radius=scene.radius))
+    if told:
+        assert answer.outcome is Outcome.OK and cKDTree(scene.truth).query(answer.shape.points)[0].max() < 0.5e-3
+    else:
+        assert answer.outcome is Outcome.NO_CORRESPONDENCE and 'two curves' in answer.detail

@@ -12,7 +12,7 @@ from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
 from fluoro_shape_ros.fit import Fit, contrast_ratio, shown
 from fluoro_shape_ros.pipeline import reconstruct
-from fluoro_shape_ros.plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
+from fluoro_shape_ros.plausibility import blunt, check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
@@ -102,12 +102,27 @@ def test_a_clear_device_raises_no_doubt():
     (dict(beyond=np.array([[0.0, 0.0], [0.0, 0.9]])), Outcome.DIRECTIONS_DISAGREE, 'last end'),
     (dict(beyond=np.array([[0.0, 0.0], [-0.4, -0.3]])), Outcome.POORLY_EXPLAINED, 'last end'),
     (dict(aside=np.array([[0.0, 0.9], [0.9, 0.8]])), Outcome.POORLY_EXPLAINED, 'last end'),
+    (dict(end_sigma=np.array([5e-5, 5e-4]), aside=np.array([[0.0, 0.0], [0.0, 0.9]])), Outcome.POORLY_EXPLAINED, 'last end is not clear'),
     (dict(presence=hidden(0.055, 0.07, 1)), Outcome.DIRECTIONS_DISAGREE, 'last end'),
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
 ])
 def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
     found, why = check_fit(device(**other), Config())
     assert found is outcome and word in why
+
+
+@pytest.mark.parametrize('other', [
+    dict(end_sigma=np.array([5e-5, 5e-4]), aside=np.array([[0.0, 0.9], [0.0, 0.0]])),      # the line is beside the other end
+    dict(end_sigma=np.array([5e-5, 3e-4]), aside=np.array([[0.0, 0.0], [0.0, 0.9]])),      # the end is clear
+    dict(end_sigma=np.array([5e-5, 5e-4]), aside=np.array([[0.0, 0.0], [0.0, 0.9]]), beyond=np.array([[0, 0], [0, 0.2]])),     # it crosses where the end points
+], ids=['other end', 'clear end', 'straight on'])
+def test_a_line_beside_a_clear_end_may_be_anything(other):
+    assert check_fit(device(**other), Config()) is None
+
+
+def test_an_end_that_leaves_the_field_is_not_blunt():
+    assert blunt(device(end_sigma=np.array([5e-4, 5e-4]), open_end=np.array([True, False]))).tolist() == [False, True]
+    assert not blunt(device()).any()
 
 
 def test_how_a_foreshortened_device_may_differ_between_planes():
