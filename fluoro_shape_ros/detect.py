@@ -16,7 +16,8 @@ from .geometry import distort, fundamental, isocenter, pixels_per_metre, project
 from .matching import align
 from .plausibility import alike_device, blunt, doubt, evidence
 from .start import first_curve
-from .strips import apparent_width, cut_along, half_width_range, likeness, odd_width, pieces
+from .profiles import apparent_width, likeness, odd_width, pieces
+from .strips import cut_along, half_width_range
 from .sweep import darkness, sweep
 
 LINES = 14              # strongest lines of an image that are looked at closely

@@ -16,9 +16,8 @@ from .extent import End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .strips import (
-    WIDTHS, Measurement, Model, Strips, apparent_width, background, best_of_worst, cut, half_width_range, likeness, mean_profile, measure, odd_width,
-    own_shadow, pieces, search, shadow)
+from .profiles import WIDTHS, apparent_width, background, best_of_worst, likeness, mean_profile, odd_width, own_shadow, pieces, shadow
+from .strips import Measurement, Model, Strips, cut, half_width_range, measure, search
 
 COARSE, MEDIUM, FINE = 2, 1, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
@@ -53,9 +52,9 @@ class Fit:
     contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, after blur
     across: np.ndarray          # (2,) the same as if seen straight on, by Beer-Lambert
     width: float                # how many times as wide as a cylinder of robot_radius it looks
-    odd_width: float            # by how much that is more than usual, see strips.odd_width
+    odd_width: float            # by how much that is more than usual, see profiles.odd_width
     likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder so wide
-    weakest: np.ndarray         # (2,) the same where it looks least like one, see strips.best_of_worst
+    weakest: np.ndarray         # (2,) the same where it looks least like one, see profiles.best_of_worst
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
 

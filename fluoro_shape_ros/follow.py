@@ -18,7 +18,8 @@ from .geometry import pixels_per_metre
 from .prior import Guess, borne_out, in_image, whole
 from .solver import Layout, solve
 from .spline import through
-from .strips import Measurement, Strips, lay_out, places, shadow
+from .profiles import shadow
+from .strips import Measurement, Strips, lay_out, places
 
 STEP_PX = 2.0           # between strips; shifts are whole px, so a path may turn by 27 degrees from the prediction
 WITHIN = 2.0            # standard deviations to either side that a strip reaches

@@ -11,7 +11,7 @@ from .fit import Fit, contrast_ratio, ends_shown, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
 MIN_WEAKEST = 0.9      # the same, of the best of the worst pieces in a row
-MAX_ODD_WIDTH = 0.15    # see strips.odd_width: robot_radius may be off by a third
+MAX_ODD_WIDTH = 0.15    # see profiles.odd_width: robot_radius may be off by a third
 MAX_CONTRAST_RATIO = 2.0
 MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends

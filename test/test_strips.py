@@ -11,9 +11,8 @@ from scipy.special import ndtr
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
-from fluoro_shape_ros.strips import (
-    WIDTHS, Measurement, Model, Strips, apparent_width, background, best_of_worst, cut, cut_along, half_width_range, likeness, mean_profile, measure, odd_width, own_shadow,
-    pieces, search, shadow)
+from fluoro_shape_ros.profiles import WIDTHS, apparent_width, background, best_of_worst, likeness, mean_profile, odd_width, own_shadow, pieces, shadow
+from fluoro_shape_ros.strips import Measurement, Model, Strips, cut, cut_along, half_width_range, measure, search
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
