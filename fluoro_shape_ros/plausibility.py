@@ -17,6 +17,7 @@ MIN_SHOWN = 0.6         # share of the device's length that each plane must show
 MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: the planes disagree where the device ends
 MIN_BEYOND = -0.25      # darkness past an end, in both planes: what is brighter there lies beside something dark, and the device turns aside
 MAX_ASIDE = 0.7         # darkness, in both planes, of a line beside where an end would go on
+TURNED_ASIDE, TURNED_BEYOND = 0.9, -0.3     # both at once, in either plane
 MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane
 MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 BLUNT, BLUNT_PX = 0.35e-3, 1.2          # the same, from which on an end is not clear: then a line beside it by MAX_ASIDE in one plane may be the device's ...
@@ -76,7 +77,8 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     for k, name in enumerate(('first', 'last')):
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * px)):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
-        if not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE):
+        turned = (f.aside[k] > TURNED_ASIDE) & (f.beyond[k] < TURNED_BEYOND)
+        if not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE or turned.any()):
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
         if blunt(f)[k] and ((f.aside[k] > MAX_ASIDE) & (f.beyond[k] < BARE)).any():
             return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'

@@ -91,6 +91,7 @@ def test_a_clear_device_raises_no_doubt():
     (dict(stop=0.015), Outcome.NO_CORRESPONDENCE, '50 px'),
     (dict(contrast=np.array([0.25, 0.005]), across=np.array([0.25, 0.005])), Outcome.POORLY_EXPLAINED, 'round device'),
     (dict(likeness=np.array([0.5, 0.99])), Outcome.POORLY_EXPLAINED, '0.50'),
+    (dict(aside=np.array([[0.5, 1.0], [0.0, 0.0]]), beyond=np.array([[0.1, -0.4], [0.0, 0.0]])), Outcome.POORLY_EXPLAINED, 'turns aside at its first end'),
     (dict(weakest=np.array([0.95, 0.7])), Outcome.POORLY_EXPLAINED, 'follows another line'),
     (dict(width=1.5, odd_width=0.31), Outcome.POORLY_EXPLAINED, '1.5 times'),
     (dict(width=0.5, odd_width=0.26), Outcome.POORLY_EXPLAINED, '0.5 times'),
