@@ -19,7 +19,7 @@ from .spline import Spline3, prolong, through
 from .profiles import WIDTHS, apparent_width, background, best_of_worst, likeness, mean_profile, odd_width, own_shadow, pieces, shadow
 from .strips import Measurement, Model, Strips, cut, half_width_range, measure, search
 
-COARSE, MEDIUM, FINE = 2, 1, 3
+COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 COARSE_STEP = 3         # px between the strips of a coarse round
 SETTLED_PX = 0.08       # a fine round that moves the curve less is the last
@@ -85,13 +85,13 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         for _ in range(coarse):
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach + WIDE_PX, rough=True)
             spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within).spline
-        for _ in range(MEDIUM):
+        if not coarse:
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
             seen = measure(strips, cylinder, within)
             spline = solve(layout, spline, strips, seen, views, within).spline
-        stretch = supported(seen.presence.T, COARSE_STEP)
-        if stretch is not None:
-            reference = (layout.s[stretch[0]], layout.s[stretch[1]])
+            stretch = supported(seen.presence.T, COARSE_STEP)
+            if stretch is not None:
+                reference = (layout.s[stretch[0]], layout.s[stretch[1]])
         layout = Layout.of(spline, step)
         s = layout.s
         for _ in range(fine):

@@ -14,6 +14,7 @@ from .geometry import distort
 
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
+FOUND_PX = 0.3          # what `search` is worth
 SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
 
 
@@ -166,7 +167,7 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     """Where the darkest line that fits its plane's profile, a row of `shadows` (V, w), narrower than the strips, lies in each, averaged over `smooth` strips.
 
-    Worth about a pixel; worth nothing where the line found is much fainter or darker than it usually is: there something hides the device.
+    Worth FOUND_PX; worth nothing where the line found is much fainter or darker than it usually is: there something hides the device.
     """
     half = (shadows.shape[1] - 1) // 2
     inner = slice(half // 2, -(half // 2) or None)
@@ -174,11 +175,13 @@ def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     response = np.stack([cv2.blur(-cv2.filter2D(p, cv2.CV_32F, k[None], borderType=cv2.BORDER_REPLICATE), (1, smooth))[:, inner]
                          for p, k in zip(strips.profiles, kernels)])
     best = np.argmax(response, axis=2)
-    darkest = np.take_along_axis(response, best[..., None], axis=2)[..., 0]
+    at = np.clip(best, 1, response.shape[2] - 2)[..., None] + np.array([-1, 0, 1])
+    before, darkest, after = np.moveaxis(np.take_along_axis(response, at, axis=2), 2, 0)
+    beside = 0.5 * (before - after) / np.minimum(before - 2 * darkest + after, -1e-9)       # where the parabola through the three is highest
     usual = [max(float(middle(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)]
     strength = darkest / np.array(usual)[:, None]
     believed = strips.inside & (strength > 0.4) & (strength < 2.5)
-    return Measurement(strips.offsets_px[inner][best], np.where(believed, 1.0, np.inf), strength, np.ones(len(strength)))
+    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5), np.where(believed, FOUND_PX**2, np.inf), strength, np.ones(len(strength)))
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:
