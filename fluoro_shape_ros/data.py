@@ -41,9 +41,9 @@ class Distortion:
     R: np.ndarray       # (3, 3) rectifying rotation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
-    """One calibrated X-ray view: source (pinhole), detector (image) and where they stand."""
+    """One calibrated X-ray view: source (pinhole), detector (image) and where they stand. Equal is only the same object."""
 
     name: str           # 'a' or 'b'
     P: np.ndarray       # (3, 4) projection, reference frame (m) to pixels; |P[2, :3]| = 1, so w is the depth in m

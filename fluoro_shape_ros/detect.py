@@ -45,6 +45,7 @@ class Detection:
     outcome: Outcome
     detail: str
     seen_px: tuple[np.ndarray | None, np.ndarray | None]    # (N, 2) image pixels as received
+    doubt: tuple[Outcome, str] | None = None    # why the fit may not be believed
 
 
 Lines = tuple[Candidate | None, Candidate | None]       # of planes a and b; None where the line there is not the device's
@@ -57,12 +58,10 @@ class Attempt:
 
     fit: Fit
     share: float            # of the lines it comes from that it explains
+    weight: float           # that share of its evidence
+    doubt: tuple[Outcome, str] | None
     lines: Lines
     start: np.ndarray       # (M, 3) m
-
-    @property
-    def weight(self) -> float:
-        return self.share * evidence(self.fit)
 
     @property
     def convincing(self) -> bool:
@@ -91,7 +90,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
                 if fitted is None:
                     break
                 share = min(explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None)
-                attempt = Attempt(fitted, share, lines, points)
+                attempt = Attempt(fitted, share, share * evidence(fitted), doubt(fitted, min_length_px), lines, points)
                 yield attempt
                 if not attempt.promising:
                     break
@@ -100,14 +99,14 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     tried, settled = [], None
     for attempt in attempts((start for start in _pairs(views, candidates) if settled is None or start[1] == settled.lines), 1):
         tried.append(attempt)
-        if settled is None and attempt.convincing and not doubt(attempt.fit, min_length_px):
+        if settled is None and attempt.convincing and not attempt.doubt:
             settled = attempt       # but for the same lines read the other way round
     if not tried:
         return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
     chosen = max(tried, key=lambda t: t.weight)
-    if not chosen.convincing or doubt(chosen.fit, min_length_px):       # who tries often must ask for more: clear ends too
+    if not chosen.convincing or chosen.doubt:       # who tries often must ask for more: clear ends too
         more = attempts(_again(images, fields, views, candidates, widths, tried), 2)
-        chosen = next((t for t in more if t.convincing and not blunt(t.fit).any() and not doubt(t.fit, min_length_px)), chosen)
+        chosen = next((t for t in more if t.convincing and not blunt(t.fit).any() and not t.doubt), chosen)
     others = [t for t in tried if t.weight > RIVAL * chosen.weight and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
     if others:      # lines along epipolar lines: only the ends tell which way round they belong together
         chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
@@ -116,7 +115,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     seen = tuple(_projected(chosen.fit, v) if c is None else c.points_px for v, c in zip(views, chosen.lines))
     if chosen.share < MIN_EXPLAINED:
         return Detection(None, Outcome.POORLY_EXPLAINED, f'only {100 * chosen.share:.0f} % of the line seen in one plane are explained', seen)
-    return Detection(chosen.fit, Outcome.OK, 'ok', seen)
+    return Detection(chosen.fit, Outcome.OK, 'ok', seen, chosen.doubt)
 
 
 def _pairs(views, candidates) -> Iterator[Start]:

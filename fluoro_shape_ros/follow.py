@@ -91,7 +91,7 @@ def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | N
     shift = gaussian_filter1d(shifts[best].astype(float), 4.0, axis=1, mode='nearest')
     path = Measurement(shift, np.where(seen, 1.0, np.inf), gain, np.ones(2))
     strips = Strips(centers, normals, speed, strength, shifts, seen, seen)
-    moved = solve(layout, spline, strips, path, views, np.ones(len(layout.s), bool)).spline
+    moved = solve(layout, spline, strips, path, views, np.ones(len(layout.s), bool), near=False).spline
     return moved(np.linspace(layout.s[both[0]], layout.s[both[-1]], 200))
 
 

@@ -7,6 +7,7 @@ coordinates, u to the right, v down. Nothing here looks at an image.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -67,6 +68,13 @@ def plane_angle(views: tuple[View, View]) -> float:
     """Angle between the two viewing directions, rad, in [0, pi/2]: 0 where they are parallel or opposite."""
     a, b = (v.P[2, :3] for v in views)     # unit: see View.P
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)))
+
+
+@lru_cache(16)
+def check(views: tuple[View, View], radius: float) -> None:
+    """Raises GeometryError where a device of `radius` (m) can't be reconstructed with these views. What has passed is known."""
+    check_pair(views)
+    check_scale(views, radius)
 
 
 def check_pair(views: tuple[View, View]) -> None:

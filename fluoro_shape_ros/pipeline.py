@@ -17,9 +17,9 @@ from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
 from .follow import curve, found_near, reach_px
-from .geometry import GeometryError, check_pair, check_scale, crop, distort, pixels_per_metre, project, undistort
+from .geometry import GeometryError, check, crop, distort, pixels_per_metre, project, undistort
 from .mask import subtract
-from .plausibility import check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
+from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .planes import both
 from .prior import Guess, borne_out, informed, judged, look
 
@@ -32,8 +32,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
     """The backbone seen in a pair of images, or the reason why there is none. Pure: the same pair gives the same answer."""
     clock = _Stopwatch()
     try:
-        check_pair(frame.views)
-        check_scale(frame.views, config.detection.robot_radius)
+        check(frame.views, config.detection.robot_radius)
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
     images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
@@ -72,7 +71,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     shape = backbone(f, forward, config.curve.backbone_spacing)
     clock.lap('backbone')
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
-    doubt = (check_fit(f, config) or check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
+    doubt = (found.doubt or check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
              or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
     clock.lap('plausibility')
     if doubt:

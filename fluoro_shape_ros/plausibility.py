@@ -50,13 +50,8 @@ def blunt(f: Fit) -> np.ndarray:
     return ~f.open_end & (f.end_sigma > max(BLUNT, BLUNT_PX * (f.s[1] - f.s[0])))
 
 
-def check_fit(f: Fit, config: Config) -> tuple[Outcome, str] | None:
-    """Whether what both planes show along a fitted curve is one device: None, or the rejection."""
-    return doubt(f, config.detection.min_length_px)
-
-
 def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
-    """The same of a device of at least `min_length_px`."""
+    """Whether what both planes show along a fitted curve is one device of at least `min_length_px`: None, or the rejection."""
     px = f.s[1] - f.s[0]    # m
     length_px = (f.stop - f.start) / px
     if length_px < min_length_px:

@@ -123,8 +123,8 @@ class EndRow:
         return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
 
 
-def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views, within: np.ndarray, ends: Sequence[EndRow] = ()) -> Solution:
-    """One Gauss-Newton step. `ends`: what else must hold.
+def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views, within: np.ndarray, ends: Sequence[EndRow] = (), near: bool = True) -> Solution:
+    """One Gauss-Newton step. `ends`: what else must hold. near: the curve lies on the device already, so that what is far off is not it.
 
     Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's biweight); prior: third
     differences of the control points. The Jacobian of a projection has rank 2, n picks what is seen across the curve.
@@ -143,7 +143,7 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
     prior, pull = layout.prior, -(layout.stiffness @ spline.control).ravel()
     for end in ends:
         prior, pull = prior + end.band(), pull + end.row * (end.target / end.variance)
-    r, root, used = d, np.sqrt(w0), w0 > 0
+    r, root, used = d if near else np.zeros_like(d), np.sqrt(w0), w0 > 0
     for _ in range(REWEIGHTED):
         z = r * root
         spread = max(1.0, 1.4826 * float(middle(np.abs(z[used])))) if used.any() else 1.0

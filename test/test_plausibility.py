@@ -12,7 +12,7 @@ from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
 from fluoro_shape_ros.fit import Fit, contrast_ratio, shown
 from fluoro_shape_ros.pipeline import reconstruct
-from fluoro_shape_ros.plausibility import blunt, check_curvature, check_fit, check_length, check_reprojection, check_tip, curvature_limit
+from fluoro_shape_ros.plausibility import blunt, check_curvature, check_length, check_reprojection, check_tip, curvature_limit, doubt
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
@@ -61,6 +61,7 @@ def test_a_tip_nobody_knows_exceeds_every_limit(covariance):
 
 
 S = np.arange(-0.01, 0.07, 0.0003)      # m, a px each
+MIN_LENGTH_PX = Config().detection.min_length_px
 
 
 def device(**other):
@@ -82,9 +83,9 @@ def hidden(first, last, plane):
 
 
 def test_a_clear_device_raises_no_doubt():
-    assert check_fit(device(), Config()) is None
+    assert doubt(device(), MIN_LENGTH_PX) is None
     enters = dict(open_end=np.array([True, False]), beyond=np.array([[1.0, 0.0], [0, 0]]))
-    assert check_fit(device(presence=hidden(0.03, 0.04, 1), **enters), Config()) is None
+    assert doubt(device(presence=hidden(0.03, 0.04, 1), **enters), MIN_LENGTH_PX) is None
 
 
 @pytest.mark.parametrize('other, outcome, word', [
@@ -108,7 +109,7 @@ def test_a_clear_device_raises_no_doubt():
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
 ])
 def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
-    found, why = check_fit(device(**other), Config())
+    found, why = doubt(device(**other), MIN_LENGTH_PX)
     assert found is outcome and word in why
 
 
@@ -118,7 +119,7 @@ def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
     dict(end_sigma=np.array([5e-5, 5e-4]), aside=np.array([[0.0, 0.0], [0.0, 0.9]]), beyond=np.array([[0, 0], [0, 0.2]])),     # it crosses where the end points
 ], ids=['other end', 'clear end', 'straight on'])
 def test_a_line_beside_a_clear_end_may_be_anything(other):
-    assert check_fit(device(**other), Config()) is None
+    assert doubt(device(**other), MIN_LENGTH_PX) is None
 
 
 def test_an_end_that_leaves_the_field_is_not_blunt():

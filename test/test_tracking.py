@@ -67,6 +67,7 @@ def is_right(answer, scene):
 MOTIONS = {
     'sliding in': [posed(run().shape, 1 - k / 5, 0.0) for k in range(5)],       # by 2.4 to 2.8 mm a pair
     'bending': [posed(run().shape, 0.0, k / 5) for k in range(5)],
+    'bending fast': [posed(run().shape, 0.0, 0.7 * k) for k in range(4)],       # the tip swings while the base stays
     'fast across': [moved(k * STEP * 0.6, -k * STEP * 0.6, k * STEP * 0.53) for k in range(5)],
     'back and forth': [moved(STEP * (k % 2)) for k in range(5)],                # whatever was expected from the pairs before is wrong
 }
