@@ -84,7 +84,7 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         within = (layout.s >= reference[0]) & (layout.s <= reference[1])
         for _ in range(coarse):
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach + WIDE_PX, rough=True)
-            spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within, near=False).spline
+            spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within, near=grown > 0).spline
         if not coarse:
             strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
             seen = measure(strips, cylinder, within)
