@@ -9,7 +9,6 @@ import numpy as np
 from scipy.special import ndtr
 
 PRESENT = 0.5           # of the usual darkness
-HIDDEN = 0.15           # a plane that shows even less than this may be hidden there
 BRIDGED_PX = 70         # a stretch that only one plane shows, or none up to GAP_PX, does not end the device
 GAP_PX = 30
 SMOOTH_PX = 9
