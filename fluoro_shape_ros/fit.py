@@ -6,6 +6,7 @@ are perpendicular and sub-pixel, no correspondence is needed any more, and the n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -33,7 +34,8 @@ SURPRISE = 60.0         # squared difference of the planes' ends that the curve'
 OPAQUE, ROUND = 0.5, 0.99      # contrast and likeness of a line that is a device, whatever its width
 END_PX = 24             # of the device, that must show it
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
-GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther
+GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther ...
+GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
 
 
 @dataclass(frozen=True)
@@ -65,74 +67,139 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
     images, fields: (H, W) float32 (dark device) and uint8, a pair each. radius: of the device, m. coarse: rounds that search for it a few px around.
     """
     scale = [pixels_per_metre(v.P, points) for v in views]
-    half_width = [radius * k for k in scale]
-    step = 1 / max(scale)
-    longest = step * sum(v.width + v.height for v in views)
+    half_width, step = [radius * k for k in scale], 1 / max(scale)
     if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
         return None     # it goes to a source
-    reach = half_width_range(max(half_width))
-    offsets = np.arange(-reach, reach + 1)
-    template = _shadows(half_width, offsets)
-    cylinder, beside = Model.of(template, offsets), [background(t, offsets) for t in template]
-    spline = through(points, EXTENSION_PX * step)
-    reference = (0.0, arc_length(points)[-1])
-    grown, length_px, fine = 0, 0.0, FINE
-    while True:
-        if not spline.stop - spline.start < longest:
-            return None     # it has left the images, or turns back and forth in them
-        layout = Layout.of(spline, COARSE_STEP * step)
-        within = (layout.s >= reference[0]) & (layout.s <= reference[1])
-        for _ in range(coarse):
-            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach + WIDE_PX, rough=True)
-            spline = solve(layout, spline, strips, search(strips, template, smooth=3), views, within, near=grown > 0).spline
-        if not coarse:
-            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
-            seen = measure(strips, cylinder, within)
-            spline = solve(layout, spline, strips, seen, views, within).spline
-            stretch = supported(seen.presence.T, COARSE_STEP)
-            if stretch is not None:
-                reference = (layout.s[stretch[0]], layout.s[stretch[1]])
-        layout = Layout.of(spline, step)
-        s = layout.s
-        for _ in range(fine):
-            strips = cut(images, fields, views, layout.basis @ spline.control, layout.slope @ spline.control, reach)
-            within = (s >= reference[0]) & (s <= reference[1])
-            own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, beside, strips.inside, template)])
-            model = Model.of(own, strips.offsets_px)
-            seen = measure(strips, model, within)
-            solution = solve(layout, spline, strips, seen, views, within)
-            spline = solution.spline
-            stretch = supported(seen.presence.T)
-            if stretch is None:
-                return None
-            before, reference = reference, (s[stretch[0]], s[stretch[1]])
-            if solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, before)).max() < 2 * step:
-                break
-        beyond = np.stack([_beyond(seen.presence.T, stretch[0], -1), _beyond(seen.presence.T, stretch[1], 1)])
-        goes_on = [bool(not np.isnan(b).any() and ((b > GOES_ON).all() or (b > GOES_ON_ALONE).any())) for b in beyond]
-        gained = (reference[1] - reference[0]) / step - length_px
-        if not any(goes_on) or grown == GROWTH or (grown and gained <= NEAR_END_PX):
-            break
-        length_px = (reference[1] - reference[0]) / step        # look farther, as long as that finds something
-        spline, shift = prolong(spline, goes_on, GROWTH_PX * step)
-        reference = (reference[0] + shift - goes_on[0] * GROWTH_PX * step, reference[1] + shift + goes_on[1] * GROWTH_PX * step)
-        coarse, fine, grown = 1, FINE - 1, grown + 1
-    look = partial(_look, images, fields, views, reach, model)
-    found, ends = _finish(solution, s, strips, seen, reference, beyond, half_width, radius)
+    pair = _Pair.of(images, fields, views, half_width, step)
+    seen = pair.settle(through(points, EXTENSION_PX * step), (0.0, arc_length(points)[-1]), coarse, FINE)
+    if seen is None:
+        return None
+    seen, aside = pair.grow(seen)
+    s, look = seen.layout.s, partial(pair.look, seen.model)
+    found, ends = _finish(seen, half_width, radius)
     agreed = _agree(found, ends, views)
     if agreed:
-        strips, seen = look(found, s, within)
-        found, ends = _finish(solve(layout, spline, strips, seen, views, within, agreed), s, strips, seen, reference, beyond, half_width, radius)
+        strips, measured = look(found, s, seen.within)
+        solution = solve(seen.layout, found.spline, strips, measured, views, seen.within, agreed)
+        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), half_width, radius)
     found = _see_ends(look, found, ends, half_width, radius)
-    return replace(found, aside=_aside(images, fields, views, found, half_width))
+    return replace(found, aside=np.where(found.open_end[:, None], 0.0, aside))
 
 
-def _look(images, fields, views, reach_px: float, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
-    """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
-    strips = cut(images, fields, views, *f.spline.lines(s.ravel()), reach_px)
-    if s.ndim == 2:
-        strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
-    return strips, measure(strips, model, within)
+@dataclass(frozen=True)
+class _Seen:
+    """A curve that has come to rest, and what the strips across it say."""
+
+    layout: Layout
+    solution: Solution
+    strips: Strips
+    measured: Measurement
+    within: np.ndarray              # (N,) bool: the strips that counted
+    model: Model
+    stretch: tuple[int, int]        # first and last strip of the device
+
+    @property
+    def reference(self) -> tuple[float, float]:
+        """m, where the device begins and where it ends."""
+        return self.layout.s[self.stretch[0]], self.layout.s[self.stretch[1]]
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """(2, 2) darkness past the first and the last end (rows) in each plane, see _beyond."""
+        presence = self.measured.presence.T
+        return np.stack([_beyond(presence, self.stretch[0], -1), _beyond(presence, self.stretch[1], 1)])
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Both images, and what the device looks like in them."""
+
+    images: Sequence
+    fields: Sequence
+    views: Sequence
+    step: float             # m, a px of the finer plane
+    reach: float            # px to either side of the curve
+    template: np.ndarray    # (2, W) a cylinder's shadow
+    cylinder: Model
+    beside: list            # see profiles.background
+
+    @classmethod
+    def of(cls, images, fields, views, half_width, step: float) -> _Pair:
+        reach = half_width_range(max(half_width))
+        offsets = np.arange(-reach, reach + 1)
+        template = _shadows(half_width, offsets)
+        return cls(images, fields, views, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template])
+
+    def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int, fine: int, near: bool = False) -> _Seen | None:
+        """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is none."""
+        if not spline.stop - spline.start < self.step * sum(v.width + v.height for v in self.views):
+            return None     # it has left the images, or turns back and forth in them
+        cut_here = lambda layout, wider=0.0: cut(self.images, self.fields, self.views, layout.basis @ spline.control, layout.slope @ spline.control,     # noqa: E731
+                                                 self.reach + wider, rough=wider > 0)
+        layout = Layout.of(spline, COARSE_STEP * self.step)
+        within = (layout.s >= reference[0]) & (layout.s <= reference[1])
+        for _ in range(coarse):
+            strips = cut_here(layout, WIDE_PX)
+            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), self.views, within, near=near).spline
+        if not coarse:
+            strips = cut_here(layout)
+            measured = measure(strips, self.cylinder, within)
+            spline = solve(layout, spline, strips, measured, self.views, within).spline
+            stretch = supported(measured.presence.T, COARSE_STEP)
+            if stretch is not None:
+                reference = (layout.s[stretch[0]], layout.s[stretch[1]])
+        layout = Layout.of(spline, self.step)
+        for _ in range(fine):
+            strips = cut_here(layout)
+            within = (layout.s >= reference[0]) & (layout.s <= reference[1])
+            own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, self.beside, strips.inside, self.template)])
+            model = Model.of(own, strips.offsets_px)
+            measured = measure(strips, model, within)
+            solution = solve(layout, spline, strips, measured, self.views, within)
+            stretch = supported(measured.presence.T)
+            if stretch is None:
+                return None
+            seen = _Seen(layout, solution, strips, measured, within, model, stretch)
+            spline, before, reference = solution.spline, reference, seen.reference
+            if solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, before)).max() < 2 * self.step:
+                break
+        return seen
+
+    def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
+        """The curve prolonged as long as that finds more of the device, straight on or beside it; and (2, 2) what then is aside, see `aside`."""
+        by = GROWTH_PX * self.step
+        for grown in range(GROWTH + 1):
+            beyond, aside = seen.beyond, None
+            known = ~np.isnan(beyond).any(axis=1)
+            goes_on = known & ((beyond > GOES_ON).all(axis=1) | (beyond > GOES_ON_ALONE).any(axis=1))
+            if not goes_on.any():
+                aside = self.aside(seen)
+                goes_on = known & (aside > GOES_ON_ASIDE).any(axis=1)
+            if grown == GROWTH or not goes_on.any():
+                break
+            (start, stop), (spline, shift) = seen.reference, prolong(seen.solution.spline, goes_on, by)
+            longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), 1, FINE - 1, near=True)
+            more = longer is not None and np.diff(longer.reference) - (stop - start) > NEAR_END_PX * self.step
+            if longer is not None and (more or aside is None):
+                seen, aside = longer, None
+            if not more:
+                break
+        return seen, self.aside(seen) if aside is None else aside
+
+    def aside(self, seen: _Seen) -> np.ndarray:
+        """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B."""
+        px = np.arange(-80, 20)
+        s = (np.array(seen.reference)[:, None] + OUTWARD[:, None] * px * self.step).ravel()
+        strips = cut(self.images, self.fields, self.views, *seen.solution.spline.lines(s), self.reach + WIDE_PX, rough=True).halves()
+        line = search(strips, self.template.repeat(2, axis=0))
+        return middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
+
+    def look(self, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
+        """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
+        strips = cut(self.images, self.fields, self.views, *f.spline.lines(s.ravel()), self.reach)
+        if s.ndim == 2:
+            strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
+        return strips, measure(strips, model, within)
 
 
 def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
@@ -160,8 +227,9 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
-def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference, beyond, half_width, radius) -> tuple[Fit, list[End | None]]:
+def _finish(found: _Seen, half_width, radius) -> tuple[Fit, list[End | None]]:
     """The fit, and its ends where they are seen."""
+    s, strips, seen, reference, solution = found.layout.s, found.strips, found.measured, found.reference, found.solution
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
     between = (s > reference[0]) & (s < reference[1])
     profile = [mean_profile(p, between & i) for p, i in zip(strips.profiles, strips.inside)]
@@ -183,9 +251,8 @@ def _finish(solution: Solution, s, strips: Strips, seen: Measurement, reference,
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
-    found = Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-                contrast, across, width, odd, alike, weakest, np.nan_to_num(beyond), np.zeros((2, 2)))
-    return found, ends
+    return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
+               contrast, across, width, odd, alike, weakest, np.nan_to_num(found.beyond), np.zeros((2, 2))), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -233,13 +300,3 @@ def ends_shown(f: Fit) -> np.ndarray:
     px = END_PX * (f.s[1] - f.s[0])
     last = [f.presence[(f.s > low) & (f.s < high)] for low, high in ((f.start, f.start + px), (f.stop - px, f.stop))]
     return np.stack([np.ones(2) if leaves or not len(p) else np.nan_to_num(p).clip(0, 1).mean(axis=0) for p, leaves in zip(last, f.open_end)])
-
-
-def _aside(images, fields, views, f: Fit, half_width) -> np.ndarray:
-    """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B; 0 where it leaves the field."""
-    reach, px = half_width_range(max(half_width)), np.arange(-80, 20)
-    s = (np.array([f.start, f.stop])[:, None] + OUTWARD[:, None] * px * (f.s[1] - f.s[0])).ravel()
-    strips = cut(images, fields, views, *f.spline.lines(s), reach + WIDE_PX, rough=True).halves()
-    line = search(strips, _shadows(half_width, np.arange(-reach, reach + 1)).repeat(2, axis=0))
-    dark = middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
-    return np.where(f.open_end[:, None], 0.0, dark)

@@ -21,12 +21,14 @@ from .spline import through
 from .profiles import shadow
 from .strips import Measurement, Strips, lay_out, places
 
-STEP_PX = 2.0           # between strips; shifts are whole px, so a path may turn by 27 degrees from the prediction
+STEP_PX = 4.0           # between strips ...
+SHIFT_PX = 2            # ... and between shifts, so that a path may turn by 27 degrees from the prediction
 WITHIN = 2.0            # standard deviations to either side that a strip reaches
 BEYOND_PX = 30.0        # the path goes on straight past both ends: the device may be longer
 STRONGEST = 6.0         # noise deviations: a darker strip speaks no louder, it may be something else
-BEND_COST = 0.7         # of a shift that changes by a pixel from a strip to the next ...
+BEND_COST = 0.7         # of a shift that changes from a strip to the next ...
 TRUST = 0.1             # ... and what the prediction counts in each strip: its error is the same in many
+SMOOTH = 2.0            # strips, over which the path is smoothed
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
 MOVES = np.array([0, -1, 1])
 SHORTEST = 0.6          # share of the strips ...
@@ -71,11 +73,12 @@ def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | N
     spline = through(guess.points, BEYOND_PX / scale.max())
     layout = Layout.of(spline, STEP_PX / scale.max())
     sigma_px = np.interp(layout.s, np.linspace(0, arc_length(guess.points)[-1], len(guess.sigma)), guess.sigma) * scale[:, None]     # (2, N)
-    reach = int(np.ceil(WITHIN * sigma_px.max()))
+    reach = SHIFT_PX * int(np.ceil(WITHIN * sigma_px.max() / SHIFT_PX))
     shifts = np.arange(-reach, reach + 1)
     centers, normals, speed = lay_out(views, layout.basis @ spline.control, layout.slope @ spline.control)
     strength = np.stack([_response(i, f, places(v, c, n, shifts), radius * k)
-                         for i, f, v, c, n, k in zip(images, fields, views, centers, normals, scale)])
+                         for i, f, v, c, n, k in zip(images, fields, views, centers, normals, scale)])[..., ::SHIFT_PX]
+    shifts = shifts[::SHIFT_PX]
     away = shifts / sigma_px[..., None]
     best = _most_probable(np.where(np.abs(away) > WITHIN, -np.inf, strength - TRUST * away**2 / 2))
     gain = np.take_along_axis(strength, best[..., None], axis=2)[..., 0] - CLEAR
@@ -88,7 +91,7 @@ def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | N
     both = np.nonzero(seen.all(axis=0))[0]
     if len(both) < SHORTEST * seen.sum(axis=1).max():
         return None
-    shift = gaussian_filter1d(shifts[best].astype(float), 4.0, axis=1, mode='nearest')
+    shift = gaussian_filter1d(shifts[best].astype(float), SMOOTH, axis=1, mode='nearest')
     path = Measurement(shift, np.where(seen, 1.0, np.inf), gain, np.ones(2))
     strips = Strips(centers, normals, speed, strength, shifts, seen, seen)
     moved = solve(layout, spline, strips, path, views, np.ones(len(layout.s), bool), near=False).spline

@@ -107,6 +107,12 @@ def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
     return (P[:2, :3] - (x[..., :2] / x[..., 2:])[..., None] * P[2, :3]) / x[..., 2, None, None]
 
 
+def triangulation_covariance(views: tuple[View, View], X: np.ndarray, sigma_px: float) -> np.ndarray:
+    """(N, 3, 3) m^2 of (N, 3) points that follow from where both planes see them, each to `sigma_px` along u and v."""
+    J = [projection_jacobian(v.P, X) / sigma_px for v in views]
+    return np.linalg.inv(sum(j.transpose(0, 2, 1) @ j for j in J) + np.eye(3))      # nothing is known less well than to a metre
+
+
 def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
     """Magnification at the mean of (N, 3) points: image px per m across the viewing ray."""
     return float(np.sqrt(abs(np.linalg.det(P[:, :3]))) / abs(np.mean(depth(P, X))))     # det K R = f_u f_v, since |P[2, :3]| = 1

@@ -17,7 +17,7 @@ from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
 from .follow import curve, found_near, reach_px
-from .geometry import GeometryError, check, crop, distort, pixels_per_metre, project, undistort
+from .geometry import GeometryError, check, crop, distort, pixels_per_metre, project, triangulation_covariance, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .planes import both
@@ -26,6 +26,7 @@ from .prior import Guess, borne_out, informed, judged, look
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
+CALIBRATION_PX = 0.3    # what the best calibration of a plane is worth
 
 
 def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconstruction:
@@ -68,7 +69,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     ends = f.spline(np.array([f.start, f.stop]))
     known = _known_order(curve(f), prior, guess)
     forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, known)
-    shape = backbone(f, forward, config.curve.backbone_spacing)
+    shape = backbone(f, frame.views, forward, config.curve.backbone_spacing)
     clock.lap('backbone')
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
     doubt = (found.doubt or check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
@@ -112,10 +113,11 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
     return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps)
 
 
-def backbone(f: Fit, forward: bool, step: float) -> Shape:
+def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     """The fitted spline at equal arc-length steps from base to tip, with the covariance of each point.
 
-    Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of the end.
+    Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of the end. What the calibration is
+    worth adds to both: the images can't tell that they lie a little beside where it says.
     """
     u = np.linspace(f.start, f.stop, max(int((f.stop - f.start) / 2e-4), 50))
     if not forward:
@@ -127,7 +129,7 @@ def backbone(f: Fit, forward: bool, step: float) -> Shape:
     points = basis @ f.spline.control
     n = len(f.spline.control)
     half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
-    covariance = np.einsum('iamb,im->iab', half, basis)
+    covariance = np.einsum('iamb,im->iab', half, basis) + triangulation_covariance(views, points, CALIBRATION_PX)
     tangent = f.spline(at[[0, -1]], 1)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     sigma = f.end_sigma if forward else f.end_sigma[::-1]

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import (GeometryError, check_pair, check_scale, crop, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
-                                       pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
+                                       pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, triangulation_covariance, undistort)
 
 K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])
 # plane A looks along +z from z = -1, plane B along +x from x = -1
@@ -28,6 +28,11 @@ def test_jacobian_is_the_derivative_of_project():
     X, h = np.array([0.01, -0.02, 0.03]), 1e-6
     numeric = np.stack([(project(B.P, X + h * e) - project(B.P, X - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     assert_allclose(projection_jacobian(B.P, X[None])[0], numeric, rtol=1e-6)
+
+
+def test_what_a_pixel_is_worth_in_space_by_hand():
+    # at the origin, 1 m from both sources, a px is 1 mm: plane A sees x and y, plane B z and y
+    assert_allclose(triangulation_covariance((A, B), np.zeros((1, 3)), 0.5)[0], np.diag([0.25e-6, 0.125e-6, 0.25e-6]), rtol=1e-5, atol=1e-15)
 
 
 @pytest.mark.parametrize('distortion', [None, Distortion('plumb_bob', K, np.array([0.3, -0.1, 0.001, 0.002, 0.0]), np.eye(3))])
