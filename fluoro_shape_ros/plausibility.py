@@ -22,6 +22,10 @@ MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane
 MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 BLUNT, BLUNT_PX = 0.35e-3, 1.2          # the same, from which on an end is not clear: then a line beside it by MAX_ASIDE in one plane may be the device's ...
 BARE = 0.05             # ... unless straight on it is at least so dark there
+CLEAR, CLEAR_PX = 0.12e-3, 0.4          # the same, up to which an end is clear: lines that meet by chance do not end so, both at once and in both planes ...
+CLEAR_BEYOND = 0.4      # ... and darkness past it ...
+CLEARER = 2.0           # ... so that this many times as much speaks for a fit with two such ends, and its profile may be less round:
+CLEAR_LIKENESS, CLEAR_WEAKEST = 0.93, 0.85
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see `evidence`, for a length of 1 m
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
@@ -37,7 +41,7 @@ def evidence(f: Fit) -> float:
     alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness))
+    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness) * (CLEARER if clear(f) else 1.0))
 
 
 def alike_device(odd: float, likeness: np.ndarray) -> float:
@@ -50,15 +54,21 @@ def blunt(f: Fit) -> np.ndarray:
     return ~f.open_end & (f.end_sigma > max(BLUNT, BLUNT_PX * (f.s[1] - f.s[0])))
 
 
+def clear(f: Fit) -> bool:
+    """Whether both planes show, and agree on, where the device begins and where it ends."""
+    return not f.open_end.any() and f.end_sigma.max() < max(CLEAR, CLEAR_PX * (f.s[1] - f.s[0])) and f.beyond.max() < CLEAR_BEYOND
+
+
 def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     """Whether what both planes show along a fitted curve is one device of at least `min_length_px`: None, or the rejection."""
     px = f.s[1] - f.s[0]    # m
     length_px = (f.stop - f.start) / px
     if length_px < min_length_px:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
-    if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < MIN_LIKENESS:
+    certain = clear(f)
+    if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < (CLEAR_LIKENESS if certain else MIN_LIKENESS):
         return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
-    if f.weakest.min() < MIN_WEAKEST:
+    if f.weakest.min() < (CLEAR_WEAKEST if certain else MIN_WEAKEST):
         return Outcome.POORLY_EXPLAINED, 'part of it does not look like a round device (likeness {:.2f}, {:.2f}): it follows another line there'.format(*f.weakest)
     if f.odd_width > MAX_ODD_WIDTH:
         return Outcome.POORLY_EXPLAINED, f'it looks {f.width:.1f} times as wide as a device of robot_radius'
@@ -73,7 +83,7 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * px)):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
         turned = (f.aside[k] > TURNED_ASIDE) & (f.beyond[k] < TURNED_BEYOND)
-        if not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE or turned.any()):
+        if not certain and not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE or turned.any()):
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
         if blunt(f)[k] and ((f.aside[k] > MAX_ASIDE) & (f.beyond[k] < BARE)).any():
             return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'
