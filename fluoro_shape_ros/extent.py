@@ -65,10 +65,13 @@ class End:
         """m by which the planes differ; 0 where only one shows the end."""
         return abs(float(np.nan_to_num(self.seen_at[0] - self.seen_at[1])))
 
+    def disagreed(self, px_per_m: float) -> bool:
+        """Whether the planes differ by more than noise."""
+        return self.apart > 3 * float(np.hypot(*self.seen_sigma)) + DISAGREE_PX / px_per_m
+
     def honest_sigma(self, px_per_m: float) -> float:
-        """sigma in m; where the planes disagree by more than noise, the truth lies somewhere between."""
-        bounds = 3 * float(np.hypot(*self.seen_sigma)) + DISAGREE_PX / px_per_m
-        return float(np.hypot(self.sigma, self.apart / 2)) if self.apart > bounds else self.sigma
+        """sigma in m; where the planes disagree, the truth lies somewhere between."""
+        return float(np.hypot(self.sigma, self.apart / 2)) if self.disagreed(px_per_m) else self.sigma
 
 
 def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray, outward: np.ndarray, beyond: np.ndarray,

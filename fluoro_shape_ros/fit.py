@@ -36,6 +36,9 @@ END_PX = 24             # of the device, that must show it
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther ...
 GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
+BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
+CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
+HIDDEN_PX = 1.0         # what an end that only one plane shows is worth
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,13 @@ def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = 
         return None
     seen, aside = pair.grow(seen)
     s, look = seen.layout.s, partial(pair.look, seen.model)
-    found, ends = _finish(seen, half_width, radius)
+    found, ends = _finish(seen, aside, half_width, radius)
     agreed = _agree(found, ends, views)
     if agreed:
         strips, measured = look(found, s, seen.within)
         solution = solve(seen.layout, found.spline, strips, measured, views, seen.within, agreed)
-        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), half_width, radius)
-    found = _see_ends(look, found, ends, half_width, radius)
-    return replace(found, aside=np.where(found.open_end[:, None], 0.0, aside))
+        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, half_width, radius)
+    return _see_ends(look, found, ends, half_width, radius)
 
 
 @dataclass(frozen=True)
@@ -168,23 +170,24 @@ class _Pair:
     def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
         """The curve prolonged as long as that finds more of the device, straight on or beside it; and (2, 2) what then is aside, see `aside`."""
         by = GROWTH_PX * self.step
-        for grown in range(GROWTH + 1):
+        for _ in range(GROWTH):
             beyond, aside = seen.beyond, None
             known = ~np.isnan(beyond).any(axis=1)
             goes_on = known & ((beyond > GOES_ON).all(axis=1) | (beyond > GOES_ON_ALONE).any(axis=1))
             if not goes_on.any():
                 aside = self.aside(seen)
                 goes_on = known & (aside > GOES_ON_ASIDE).any(axis=1)
-            if grown == GROWTH or not goes_on.any():
-                break
+                if not goes_on.any():
+                    return seen, aside
             (start, stop), (spline, shift) = seen.reference, prolong(seen.solution.spline, goes_on, by)
             longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), 1, FINE - 1, near=True)
             more = longer is not None and np.diff(longer.reference) - (stop - start) > NEAR_END_PX * self.step
-            if longer is not None and (more or aside is None):
-                seen, aside = longer, None
+            if not more and aside is not None:
+                return seen, aside      # that line is another one
+            seen = seen if longer is None else longer
             if not more:
                 break
-        return seen, self.aside(seen) if aside is None else aside
+        return seen, self.aside(seen)
 
     def aside(self, seen: _Seen) -> np.ndarray:
         """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B."""
@@ -205,8 +208,8 @@ class _Pair:
 def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
     """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough to say where it ends."""
     rows = []
-    for end in ends:
-        if end is not None and np.isfinite(end.seen_at).all():
+    for end, alone in zip(ends, seen_alone(f)):
+        if end is not None and alone < 0 and np.isfinite(end.seen_at).all():
             row = EndRow.of(f.spline, end.at, end.seen_at, end.seen_sigma, views)
             known = row.row @ f.covariance @ row.row
             if known > UNKNOWN * row.variance and row.target**2 < SURPRISE * (known + row.variance):
@@ -227,7 +230,7 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
-def _finish(found: _Seen, half_width, radius) -> tuple[Fit, list[End | None]]:
+def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, list[End | None]]:
     """The fit, and its ends where they are seen."""
     s, strips, seen, reference, solution = found.layout.s, found.strips, found.measured, found.reference, found.solution
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
@@ -252,7 +255,7 @@ def _finish(found: _Seen, half_width, radius) -> tuple[Fit, list[End | None]]:
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-               contrast, across, width, odd, alike, weakest, np.nan_to_num(found.beyond), np.zeros((2, 2))), ends
+               contrast, across, width, odd, alike, weakest, np.nan_to_num(found.beyond), np.where(open_end[:, None], 0.0, aside)), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -263,8 +266,9 @@ def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, r
 
 def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
-    scale, step = np.array(half_width) / radius, f.s[1] - f.s[0]
-    at = np.array([f.start, f.stop])
+    scale, step, alone = np.array(half_width) / radius, f.s[1] - f.s[0], seen_alone(f)
+    hidden = np.array([end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed(1 / step) for end, v in zip(ends, alone)])
+    at = np.array([end.seen_at[v] if h else x for end, h, v, x in zip(ends, hidden, alone, (f.start, f.stop))])
     window = np.arange(-END_WINDOW_PX, END_WINDOW_PX + END_STEP_PX, END_STEP_PX) * step
     s = at[:, None] + window
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
@@ -274,9 +278,18 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -
                    density=1 / END_STEP_PX, reach_px=END_REACH_PX)
     sigma = np.zeros(2)
     for k, end in enumerate(ends):
-        if end is not None:
+        if hidden[k] and np.isfinite(again[k].seen_at[alone[k]]):
+            at[k], sigma[k] = again[k].seen_at[alone[k]], np.hypot(again[k].seen_sigma[alone[k]], HIDDEN_PX * step)
+        elif end is not None:
             at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
     return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma)
+
+
+def seen_alone(f: Fit) -> np.ndarray:
+    """(2,) the plane that alone shows the first and the last end, because a line that crosses the device there hides it in the other; -1 where there is none."""
+    dark = np.maximum(f.beyond, f.aside)
+    hidden = (dark.min(axis=1) < BARE) & (dark.max(axis=1) > HIDES) & (f.beyond.max(axis=1) < CROSSES) & ~f.open_end
+    return np.where(hidden, dark.argmin(axis=1), -1)
 
 
 def _contrast(profile: np.ndarray) -> float:

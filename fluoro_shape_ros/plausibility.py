@@ -7,7 +7,7 @@ import numpy as np
 from .config import Config
 from .curve import curvature, middle
 from .data import Outcome
-from .fit import Fit, contrast_ratio, ends_shown, shown
+from .fit import Fit, contrast_ratio, ends_shown, seen_alone, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
 MIN_WEAKEST = 0.9      # the same, of the best of the worst pieces in a row
@@ -28,6 +28,7 @@ CLEARER = 2.0           # ... so that this many times as much speaks for a fit w
 CLEAR_LIKENESS, CLEAR_WEAKEST = 0.93, 0.85
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see `evidence`, for a length of 1 m
+CERTAIN = 0.6           # the same, for a fit with an end that only one plane shows
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
 UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
 ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less likely the device
@@ -78,12 +79,13 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
-    end_shown = ends_shown(f).min(axis=1)
+    alone = (seen_alone(f) >= 0) & (evidence(f) > CERTAIN * np.sqrt(f.stop - f.start))
+    end_shown = np.where(alone, 1.0, ends_shown(f).min(axis=1))
     for k, name in enumerate(('first', 'last')):
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * px)):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
         turned = (f.aside[k] > TURNED_ASIDE) & (f.beyond[k] < TURNED_BEYOND)
-        if not certain and not f.open_end[k] and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE or turned.any()):
+        if not (certain or alone[k] or f.open_end[k]) and (f.beyond[k].max() < MIN_BEYOND or f.aside[k].min() > MAX_ASIDE or turned.any()):
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
         if blunt(f)[k] and ((f.aside[k] > MAX_ASIDE) & (f.beyond[k] < BARE)).any():
             return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'

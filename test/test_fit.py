@@ -2,21 +2,24 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.curve import arc_length, at_arc_length
+from fluoro_shape_ros.data import Frame
 from fluoro_shape_ros.field import field_of_view
-from fluoro_shape_ros.fit import fit, shown
+from fluoro_shape_ros.fit import fit, seen_alone, shown
 from fluoro_shape_ros.geometry import source
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
-from fluoro_shape_ros.sim.xray import Exposure
+from fluoro_shape_ros.sim.xray import Exposure, transmission
 
 PX = 0.3e-3
 VIEWS = biplane(arm=CArm(pixel_size_iso=PX, width=512, height=512))
+EXPOSURE = Exposure(photons=1500.0)
 STEP = 1e-4             # m between the points of a true backbone
 
 
@@ -96,6 +99,46 @@ def test_a_start_that_is_too_short_grows_to_the_end(frame, truth, end, lost):
     f = fitted(frame, truth[n:] if end == 'first' else truth[:-n])
     assert_allclose(ends(f), truth[[0, -1]], atol=0.25e-3)
     assert off(f, truth).mean() < 0.05e-3
+
+
+def photographed(points, lines=()):
+    """A frame of a device of 0.6 mm radius along (N, 3) points, and of `lines`, (M, 3) points and whether each plane shows them."""
+    images = []
+    for k, view in enumerate(VIEWS):
+        light = transmission(points, 0.0006, view, EXPOSURE)
+        for line, shown_in in lines:
+            light = light * (transmission(line, 0.0006, view, EXPOSURE) if shown_in[k] else 1.0)
+        counts = np.random.default_rng(k).poisson(EXPOSURE.photons * cv2.GaussianBlur(light, (0, 0), 0.8))
+        images.append((counts / EXPOSURE.photons * 180).clip(0, 255).astype(np.uint8))
+    return Frame(0, 'isocenter', tuple(images), VIEWS)
+
+
+def bent(turn_deg):
+    """(N, 3) m, a step each: 40 mm straight, turned by `turn_deg` over 6 mm, 20 mm straight."""
+    heading = np.deg2rad(turn_deg) * np.clip((np.arange(660) * STEP - 0.04) / 0.006, 0, 1)
+    across = np.array([0.6, 0.8, 0.0])
+    steps = np.cos(heading)[:, None] * np.array([0.0, 0.2, 0.98]) + np.sin(heading)[:, None] * across
+    return np.array([-0.01, -0.01, -0.03]) + np.cumsum(STEP * steps, axis=0)
+
+
+@pytest.mark.parametrize('turn_deg, start', [(30, 410), (40, 410), (50, 440)])
+def test_a_device_that_turns_aside_where_the_start_ends_is_followed(turn_deg, start):
+    truth = bent(turn_deg)
+    f = fitted(photographed(truth), truth[:start])
+    assert_allclose(ends(f), truth[[0, -1]], atol=0.3e-3)
+    assert off(f, truth).mean() < 0.1e-3
+
+
+@pytest.mark.parametrize('slant, plane', [(0.0, 0), (1.5, 1)])
+def test_an_end_that_another_line_hides_in_one_plane_is_where_the_other_shows_it(slant, plane):
+    truth = bent(20)
+    tangent = (truth[-1] - truth[-50]) / np.linalg.norm(truth[-1] - truth[-50])
+    aside = np.cross(tangent, [1.0, 0.0, 0.0])
+    lead = truth[-1] + np.linspace(-0.03, 0.03, 300)[:, None] * (aside / np.linalg.norm(aside) + slant * tangent)
+    f = fitted(photographed(truth, [(lead, (plane == 0, plane == 1))]), truth)
+    assert seen_alone(f).tolist() == [-1, 1 - plane]
+    assert_allclose(ends(f), truth[[0, -1]], atol=0.3e-3)
+    assert 0.2e-3 < f.end_sigma[1] < 0.35e-3
 
 
 def test_a_start_that_is_too_long_shrinks_to_the_end(frame, truth):

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
-from fluoro_shape_ros.fit import Fit, contrast_ratio, shown
+from fluoro_shape_ros.fit import Fit, contrast_ratio, seen_alone, shown
 from fluoro_shape_ros.pipeline import CALIBRATION_PX, reconstruct
-from fluoro_shape_ros.plausibility import blunt, check_curvature, check_length, check_reprojection, check_tip, curvature_limit, doubt
+from fluoro_shape_ros.plausibility import (blunt, check_curvature, check_length, check_reprojection, check_tip, clear, curvature_limit, doubt,
+                                           evidence)
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
@@ -65,10 +66,10 @@ MIN_LENGTH_PX = Config().detection.min_length_px
 
 
 def device(**other):
-    """A fit as a clearly seen device of 60 mm gives it, with some of it `other`."""
+    """A fit as a well seen device of 60 mm gives it, with some of it `other`."""
     present = np.repeat(((S > 0) & (S < 0.06)).astype(float)[:, None], 2, axis=1)
     straight = Spline3(-0.01, 0.07, np.c_[np.arange(10) * 0.01, np.zeros((10, 2))])
-    clear = dict(spline=straight, start=0.0, stop=0.06, end_sigma=np.full(2, 5e-5), open_end=np.array([False, False]),
+    clear = dict(spline=straight, start=0.0, stop=0.06, end_sigma=np.full(2, 2e-4), open_end=np.array([False, False]),
                  covariance=np.eye(30) * 1e-10, s=S, presence=present, offset_px=np.zeros((len(S), 2)),
                  contrast=np.array([0.25, 0.25]), across=np.array([0.25, 0.25]), width=0.9, odd_width=0.0,
                  likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)))
@@ -120,6 +121,39 @@ def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
 ], ids=['other end', 'clear end', 'straight on'])
 def test_a_line_beside_a_clear_end_may_be_anything(other):
     assert doubt(device(**other), MIN_LENGTH_PX) is None
+
+
+CLEAR = dict(end_sigma=np.full(2, 5e-5))
+TURNED = dict(aside=np.array([[0.5, 1.0], [0.0, 0.0]]), beyond=np.array([[0.1, -0.4], [0.0, 0.0]]))
+
+
+@pytest.mark.parametrize('other', [dict(likeness=np.array([0.94, 0.99])), dict(weakest=np.array([0.87, 0.98])), TURNED,
+                                   dict(contrast=np.array([0.17, 0.25]), across=np.array([0.17, 0.25]), likeness=np.array([0.97, 0.97]))],
+                         ids=['less like', 'less like in part', 'a line beside', 'less dark'])
+def test_two_clear_ends_outweigh_what_alone_would_be_a_doubt(other):
+    assert doubt(device(**other), MIN_LENGTH_PX) is not None
+    assert doubt(device(**other, **CLEAR), MIN_LENGTH_PX) is None
+
+
+@pytest.mark.parametrize('other', [dict(end_sigma=np.array([5e-5, 1.3e-4])), dict(open_end=np.array([True, False])),
+                                   dict(beyond=np.array([[0.0, 0.0], [0.0, 0.45]]))], ids=['one is not', 'one leaves', 'one goes on'])
+def test_ends_are_clear_only_together(other):
+    assert clear(device(**CLEAR)) and not clear(device(**CLEAR | other))
+    assert_allclose(evidence(device(**CLEAR)), 2 * evidence(device()))
+
+
+def test_an_end_that_a_line_hides_in_one_plane_is_seen_by_the_other_alone():
+    crossed = dict(aside=np.array([[0.0, 0.1], [0.9, 0.1]]), beyond=np.array([[0.0, 0.0], [0.3, -0.1]]))
+    assert seen_alone(device(**crossed)).tolist() == [-1, 1]
+    assert doubt(device(**crossed, presence=hidden(0.055, 0.07, 0)), MIN_LENGTH_PX) is None
+    assert 'only one plane' in doubt(device(presence=hidden(0.055, 0.07, 0)), MIN_LENGTH_PX)[1]
+
+
+@pytest.mark.parametrize('aside, beyond', [([0.9, 0.5], [0.3, 0.0]), ([0.5, 0.1], [0.3, 0.0]), ([0.9, 0.1], [0.7, 0.0]), ([0.9, 0.1], [0.3, 0.4])],
+                         ids=['both are crossed', 'nothing crosses', 'the device goes on', 'it goes on in the other'])
+def test_where_no_plane_shows_an_end_alone(aside, beyond):
+    f = device(aside=np.array([[0.0, 0.0], aside]), beyond=np.array([[0.0, 0.0], beyond]))
+    assert seen_alone(f).tolist() == [-1, -1]
 
 
 def test_an_end_that_leaves_the_field_is_not_blunt():
