@@ -14,7 +14,7 @@ from .data import Outcome
 from .fit import COARSE, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
-from .plausibility import alike_device, blunt, doubt, evidence
+from .plausibility import alike_device, blunt, clear, doubt, evidence
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
 from .strips import cut_along, half_width_range
@@ -34,7 +34,7 @@ EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it ...
 PROMISING = 0.08        # ... and that makes another try worth while
-ASIDE = 0.8             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
+ASIDE = 0.8             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew unless its ends are clear
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def _projected(f: Fit, view) -> np.ndarray:
 def track(images, fields, views, radius: float, min_length_px: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
     fitted = fit(images, fields, views, points, radius, coarse=1)
-    if fitted is None or fitted.aside.max() > ASIDE or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
+    if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
         return None
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in views))
 
