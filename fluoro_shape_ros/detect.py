@@ -17,7 +17,7 @@ from .matching import align
 from .plausibility import alike_device, blunt, clear, doubt, evidence
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
-from .strips import cut_along, half_width_range
+from .strips import Sheet, cut_along, half_width_range
 from .sweep import darkness, sweep
 
 LINES = 14              # strongest lines of an image that are looked at closely
@@ -82,11 +82,13 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
         if not found:
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
 
+    sheet = Sheet.of(images, fields, views)
+
     def attempts(starts, times: int) -> Iterator[Attempt]:
         """Fits, each as often again from where it came to lie: a start some px off may catch on another line where the next does not."""
         for points, lines, coarse in starts:
             for _ in range(times):
-                fitted = fit(images, fields, views, points, radius, coarse)
+                fitted = fit(sheet, points, radius, coarse)
                 if fitted is None:
                     break
                 share = min(explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None)
@@ -161,12 +163,12 @@ def _projected(f: Fit, view) -> np.ndarray:
     return distort(view, project(view.P, f.spline(np.linspace(f.start, f.stop, 100))))
 
 
-def track(images, fields, views, radius: float, min_length_px: float, points: np.ndarray) -> Detection | None:
+def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
-    fitted = fit(images, fields, views, points, radius, coarse=1)
+    fitted = fit(sheet, points, radius, coarse=1)
     if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
         return None
-    return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in views))
+    return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views))
 
 
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:

@@ -6,7 +6,6 @@ are perpendicular and sub-pixel, no correspondence is needed any more, and the n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,10 +17,11 @@ from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
 from .profiles import WIDTHS, apparent_width, background, best_of_worst, likeness, mean_profile, odd_width, own_shadow, pieces, shadow
-from .strips import Measurement, Model, Strips, cut, half_width_range, measure, search
+from .strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
+LONGEST_PX = 16000      # OpenCV samples 32767 rows at once: the strips of both planes
 COARSE_STEP = 3         # px between the strips of a coarse round
 SETTLED_PX = 0.08       # a fine round that moves the curve less is the last
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
@@ -64,16 +64,17 @@ class Fit:
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
 
 
-def fit(images, fields, views, points: np.ndarray, radius: float, coarse: int = COARSE) -> Fit | None:
+def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
-    images, fields: (H, W) float32 (dark device) and uint8, a pair each. radius: of the device, m. coarse: rounds that search for it a few px around.
+    radius: of the device, m. coarse: rounds that search for it a few px around.
     """
+    views = sheet.views
     scale = [pixels_per_metre(v.P, points) for v in views]
     half_width, step = [radius * k for k in scale], 1 / max(scale)
     if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
         return None     # it goes to a source
-    pair = _Pair.of(images, fields, views, half_width, step)
+    pair = _Pair.of(sheet, half_width, step)
     seen = pair.settle(through(points, EXTENSION_PX * step), (0.0, arc_length(points)[-1]), coarse, FINE)
     if seen is None:
         return None
@@ -114,11 +115,9 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Both images, and what the device looks like in them."""
+    """A pair of images, and what the device looks like in them."""
 
-    images: Sequence
-    fields: Sequence
-    views: Sequence
+    sheet: Sheet
     step: float             # m, a px of the finer plane
     reach: float            # px to either side of the curve
     template: np.ndarray    # (2, W) a cylinder's shadow
@@ -126,27 +125,27 @@ class _Pair:
     beside: list            # see profiles.background
 
     @classmethod
-    def of(cls, images, fields, views, half_width, step: float) -> _Pair:
+    def of(cls, sheet: Sheet, half_width, step: float) -> _Pair:
         reach = half_width_range(max(half_width))
         offsets = np.arange(-reach, reach + 1)
         template = _shadows(half_width, offsets)
-        return cls(images, fields, views, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template])
+        return cls(sheet, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template])
 
     def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int, fine: int, near: bool = False) -> _Seen | None:
         """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is none."""
-        if not spline.stop - spline.start < self.step * sum(v.width + v.height for v in self.views):
+        views = self.sheet.views
+        if not spline.stop - spline.start < self.step * min(LONGEST_PX, sum(v.width + v.height for v in views)):
             return None     # it has left the images, or turns back and forth in them
-        cut_here = lambda layout, wider=0.0: cut(self.images, self.fields, self.views, layout.basis @ spline.control, layout.slope @ spline.control,     # noqa: E731
-                                                 self.reach + wider, rough=wider > 0)
+        cut_here = lambda layout, wider=0.0: cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + wider, wider > 0)     # noqa: E731
         layout = Layout.of(spline, COARSE_STEP * self.step)
         within = (layout.s >= reference[0]) & (layout.s <= reference[1])
         for _ in range(coarse):
             strips = cut_here(layout, WIDE_PX)
-            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), self.views, within, near=near).spline
+            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within, near=near).spline
         if not coarse:
             strips = cut_here(layout)
             measured = measure(strips, self.cylinder, within)
-            spline = solve(layout, spline, strips, measured, self.views, within).spline
+            spline = solve(layout, spline, strips, measured, views, within).spline
             stretch = supported(measured.presence.T, COARSE_STEP)
             if stretch is not None:
                 reference = (layout.s[stretch[0]], layout.s[stretch[1]])
@@ -157,7 +156,7 @@ class _Pair:
             own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, self.beside, strips.inside, self.template)])
             model = Model.of(own, strips.offsets_px)
             measured = measure(strips, model, within)
-            solution = solve(layout, spline, strips, measured, self.views, within)
+            solution = solve(layout, spline, strips, measured, views, within)
             stretch = supported(measured.presence.T)
             if stretch is None:
                 return None
@@ -193,13 +192,13 @@ class _Pair:
         """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B."""
         px = np.arange(-80, 20)
         s = (np.array(seen.reference)[:, None] + OUTWARD[:, None] * px * self.step).ravel()
-        strips = cut(self.images, self.fields, self.views, *seen.solution.spline.lines(s), self.reach + WIDE_PX, rough=True).halves()
+        strips = cut(self.sheet, *seen.solution.spline.lines(s), self.reach + WIDE_PX, rough=True).halves()
         line = search(strips, self.template.repeat(2, axis=0))
         return middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
 
     def look(self, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
         """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
-        strips = cut(self.images, self.fields, self.views, *f.spline.lines(s.ravel()), self.reach)
+        strips = cut(self.sheet, *f.spline.lines(s.ravel()), self.reach)
         if s.ndim == 2:
             strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
         return strips, measure(strips, model, within)

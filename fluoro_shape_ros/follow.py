@@ -19,7 +19,7 @@ from .prior import Guess, borne_out, in_image, whole
 from .solver import Layout, solve
 from .spline import through
 from .profiles import shadow
-from .strips import Measurement, Strips, lay_out, places
+from .strips import Measurement, Sheet, Strips, lay_out
 
 STEP_PX = 4.0           # between strips ...
 SHIFT_PX = 2            # ... and between shifts, so that a path may turn by 27 degrees from the prediction
@@ -36,21 +36,21 @@ SEEN = 0.93             # ... and how many of these must be clear, for a path th
 SHARP = 0.35e-3         # m: an end less certain than this may be another one
 
 
-def found_near(images, fields, views, config: Config, guess: Guess) -> Detection | None:
+def found_near(sheet: Sheet, config: Config, guess: Guess) -> Detection | None:
     """The device near a guess; None where the images show none there that leaves no doubt, so that all of them must be searched.
 
-    images, fields: (H, W) float32 (dark device, even noise; needed only within reach_px) and uint8, a pair each.
+    sheet: of images with even noise; needed only within reach_px.
     """
-    start = follow(images, fields, views, guess, config.detection.robot_radius)
+    start = follow(sheet, guess, config.detection.robot_radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = track(images, fields, views, config.detection.robot_radius, config.detection.min_length_px, start)
+    found = track(sheet, config.detection.robot_radius, config.detection.min_length_px, start)
     if found is None:
         return None
     f = found.fit
     points = curve(f)
     sharp = (f.open_end | (f.end_sigma < SHARP)).all()
-    believed = sharp and whole(f.stop - f.start, guess, views) and borne_out(points, guess)
+    believed = sharp and whole(f.stop - f.start, guess, sheet.views) and borne_out(points, guess)
     return found if believed else None
 
 
@@ -64,11 +64,9 @@ def reach_px(guess: Guess, view) -> float:
     return WITHIN * float(guess.sigma.max()) * pixels_per_metre(view.P, guess.points) + BEYOND_PX + 50
 
 
-def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | None:
-    """(M, 3) points in m along what looks most like the device of `radius` m near `guess`, base to tip; None where nothing does.
-
-    images, fields: (H, W) float32 (dark device, even noise) and uint8, a pair each.
-    """
+def follow(sheet: Sheet, guess: Guess, radius: float) -> np.ndarray | None:
+    """(M, 3) points in m along what looks most like the device of `radius` m near `guess`, base to tip; None where nothing does."""
+    views = sheet.views
     scale = np.array([pixels_per_metre(v.P, guess.points) for v in views])
     spline = through(guess.points, BEYOND_PX / scale.max())
     layout = Layout.of(spline, STEP_PX / scale.max())
@@ -76,8 +74,7 @@ def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | N
     reach = SHIFT_PX * int(np.ceil(WITHIN * sigma_px.max() / SHIFT_PX))
     shifts = np.arange(-reach, reach + 1)
     centers, normals, speed = lay_out(views, layout.basis @ spline.control, layout.slope @ spline.control)
-    strength = np.stack([_response(i, f, places(v, c, n, shifts), radius * k)
-                         for i, f, v, c, n, k in zip(images, fields, views, centers, normals, scale)])[..., ::SHIFT_PX]
+    strength = _response(sheet, sheet.places(centers, normals, shifts), radius * scale)[..., ::SHIFT_PX]
     shifts = shifts[::SHIFT_PX]
     away = shifts / sigma_px[..., None]
     best = _most_probable(np.where(np.abs(away) > WITHIN, -np.inf, strength - TRUST * away**2 / 2))
@@ -98,16 +95,17 @@ def follow(images, fields, views, guess: Guess, radius: float) -> np.ndarray | N
     return moved(np.linspace(layout.s[both[0]], layout.s[both[-1]], 200))
 
 
-def _response(image: np.ndarray, field: np.ndarray, at: tuple[np.ndarray, np.ndarray], half_width_px: float) -> np.ndarray:
-    """(N, W) how much darker than beside it each pixel at (N, W) u, v is, over the device's width, in noise deviations; 0 outside the field."""
-    profiles = cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    lit = cv2.remap(field, *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    half = int(np.ceil(1.6 * half_width_px + 3))
-    template = shadow(half_width_px, np.arange(-half, half + 1))
-    response = -cv2.filter2D(profiles, cv2.CV_32F, (template - template.mean())[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
-    lit = cv2.erode(lit, np.ones((1, 2 * half + 1), np.uint8), borderValue=255) > 0
-    noise = 1.4826 * float(middle(np.abs(response[lit][::3]))) + 1e-6 if lit.any() else 1.0
-    return np.where(lit, np.clip(response / noise, -1.0, STRONGEST), 0.0).astype(np.float32)
+def _response(sheet: Sheet, at: tuple[np.ndarray, np.ndarray], half_width_px: np.ndarray) -> np.ndarray:
+    """(V, N, W) how much darker than beside it each place at (V, N, W) columns and rows is, over the device's width, in noise deviations; 0 outside the field."""
+    profiles, lit = sheet.sample(*at, cv2.INTER_LINEAR), sheet.exposed(*at)
+    half = int(np.ceil(1.6 * half_width_px.max() + 3))
+    templates = [shadow(h, np.arange(-half, half + 1)) for h in half_width_px]
+    response = np.stack([cv2.filter2D(p, cv2.CV_32F, (t.mean() - t)[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE) for p, t in zip(profiles, templates)])
+    if not lit.all():
+        flat = lit.astype(np.uint8).reshape(-1, lit.shape[2])
+        lit = cv2.erode(flat, np.ones((1, 2 * half + 1), np.uint8), borderValue=255).reshape(lit.shape) > 0
+    noise = [1.4826 * float(middle(np.abs(r[i][::3]))) + 1e-6 if i.any() else 1.0 for r, i in zip(response, lit)]
+    return np.where(lit, np.clip(response / np.array(noise, np.float32)[:, None, None], -1.0, STRONGEST), 0.0)
 
 
 def _darkest_stretch(gain: np.ndarray) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from .mask import subtract
 from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .planes import both
 from .prior import Guess, borne_out, informed, judged, look
+from .strips import Sheet
 
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
@@ -165,8 +166,9 @@ def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] =
 
 def _near(regions, look, images, fields, views, polarity: str, *known) -> Detection | None:
     """What `look` finds in these regions of both planes; None where it finds nothing, or something that may go on beyond them."""
-    cropped = [stable_noise(i, polarity, r) for i, r in zip(images, regions)], [f[r] for f, r in zip(fields, regions)], [crop(v, *r) for v, r in zip(views, regions)]
-    found = look(*cropped, *known)
+    sheet = Sheet.of([stable_noise(i, polarity, r) for i, r in zip(images, regions)], [f[r] for f, r in zip(fields, regions)],
+                     [crop(v, *r) for v, r in zip(views, regions)])
+    found = look(sheet, *known)
     if found is None:
         return None
     seen = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +16,7 @@ from .geometry import distort
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
 FOUND_PX = 0.3          # what `search` is worth
+MARGIN_PX = 4           # of a Sheet: interpolation reaches 2 px
 SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
 
 
@@ -52,18 +54,65 @@ def half_width_range(half_width_px: float) -> float:
     return float(np.ceil(1.6 * half_width_px + 5.0))
 
 
-def cut(images, fields, views, points: np.ndarray, tangents: np.ndarray, reach_px: float, rough: bool = False) -> Strips:
-    """Strips of the (H, W) float32 images across the projections of (N, 3) points with (N, 3) tangents dX/ds, one a point and plane.
+@dataclass(frozen=True)
+class Sheet:
+    """The images of V planes one below the other, so that one call samples all of them."""
+
+    image: np.ndarray       # (H, W) float32
+    field: np.ndarray       # (H, W) uint8
+    top: np.ndarray         # (V, 1, 1) float32, row where each plane begins
+    heights: np.ndarray     # (V, 1, 1) float32
+    views: Sequence[View]
+
+    @classmethod
+    def of(cls, images, fields, views) -> Sheet:
+        """From V (H, W) float32 images (dark device) and uint8 fields. Around each lie MARGIN_PX rows of its own border, exposed nowhere."""
+        heights, width = np.array([len(i) for i in images]), max(i.shape[1] for i in images)
+        below = np.cumsum(heights + 2 * MARGIN_PX)
+        image, field = np.empty((below[-1], width), np.float32), np.empty((below[-1], width), np.uint8)
+        for rows, i, f in zip(map(slice, below - heights - 2 * MARGIN_PX, below), images, fields):
+            beside = MARGIN_PX, MARGIN_PX, 0, width - i.shape[1]
+            cv2.copyMakeBorder(i, *beside, cv2.BORDER_REPLICATE, dst=image[rows])
+            cv2.copyMakeBorder(f, *beside, cv2.BORDER_CONSTANT, dst=field[rows], value=0)
+        column = lambda x: x[:, None, None].astype(np.float32)      # noqa: E731
+        return cls(image, field, column(below - heights - MARGIN_PX), column(heights), views)
+
+    def places(self, centers: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(V, N, W) float32 column and row of the samples of N strips at (W,) offsets."""
+        u, v = places(centers, normals, offsets)
+        for k, view in enumerate(self.views):
+            if view.distortion is not None:
+                u[k], v[k] = distort(view, np.stack([u[k], v[k]], axis=2).reshape(-1, 2)).T.reshape(2, *u[k].shape)
+        np.minimum(np.maximum(v, -2, out=v), self.heights + 1, out=v)     # into the margin: what lies outside a plane looks like its border
+        v += self.top
+        return u, v
+
+    def sample(self, u: np.ndarray, v: np.ndarray, interpolation: int) -> np.ndarray:
+        """(V, N, W) image values there."""
+        return _remap(self.image, u, v, interpolation, cv2.BORDER_REPLICATE)
+
+    def exposed(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """(V, N, W) bool: whether they lie in the field."""
+        return _remap(self.field, u, v, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
+
+
+def _remap(image: np.ndarray, u: np.ndarray, v: np.ndarray, interpolation: int, border: int) -> np.ndarray:
+    flat = -1, u.shape[-1]
+    return cv2.remap(image, u.reshape(flat), v.reshape(flat), interpolation, borderMode=border, borderValue=0).reshape(u.shape)
+
+
+def cut(sheet: Sheet, points: np.ndarray, tangents: np.ndarray, reach_px: float, rough: bool = False) -> Strips:
+    """Strips across the projections of (N, 3) points with (N, 3) tangents dX/ds, one a point and plane.
 
     rough: interpolated linearly, several times as fast; for what is looked for to a pixel.
     """
-    centers, normals, speed = lay_out(views, points, tangents)
+    centers, normals, speed = lay_out(sheet.views, points, tangents)
     offsets = np.arange(-reach_px, reach_px + 1)
-    profiles = np.empty((*speed.shape, len(offsets)), np.float32)
-    inside, lit = np.empty(speed.shape, bool), np.empty(speed.shape, bool)
-    for k, plane in enumerate(zip(images, fields, views, centers, normals)):
-        profiles[k], inside[k], lit[k] = _sample(*plane, offsets, cv2.INTER_LINEAR if rough else cv2.INTER_CUBIC)
-    return Strips(centers, normals, speed, profiles, offsets, inside, lit)
+    u, v = sheet.places(centers, normals, offsets)
+    ends = [0, len(offsets) // 2, -1]
+    exposed = sheet.exposed(u[..., ends], v[..., ends])
+    profiles = sheet.sample(u, v, cv2.INTER_LINEAR if rough else cv2.INTER_CUBIC)
+    return Strips(centers, normals, speed, profiles, offsets, exposed.all(axis=2), exposed[..., 1])
 
 
 def lay_out(views, points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -80,12 +129,10 @@ def lay_out(views, points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray
     return centers, normals, speed
 
 
-def places(view: View | None, centers: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, W) float32 u and v in the image as received, of the samples of N strips at (W,) offsets."""
-    u, v = (c[:, None] + n[:, None] * offsets.astype(np.float32) for c, n in zip(centers.T.astype(np.float32), normals.T.astype(np.float32)))
-    if view is not None and view.distortion is not None:
-        u, v = distort(view, np.stack([u, v], axis=2).reshape(-1, 2)).T.reshape(2, *u.shape).astype(np.float32)
-    return u, v
+def places(centers: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(..., N, W) float32 u and v of the samples of (..., N, 2) strips at (W,) offsets."""
+    centers, normals, offsets = (x.astype(np.float32) for x in (centers, normals, offsets))
+    return centers[..., 0, None] + normals[..., 0, None] * offsets, centers[..., 1, None] + normals[..., 1, None] * offsets
 
 
 def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], reach_px: float) -> tuple[Strips, np.ndarray]:
@@ -100,17 +147,11 @@ def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], 
     along = (total[high + 1] - total[at]) / (high + 1 - at)[:, None] - (total[at + 1] - total[low]) / (at + 1 - low)[:, None]     # from the mean behind to that ahead
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / (np.hypot(along[:, 0], along[:, 1]) + 1e-9)[:, None]
     offsets = np.arange(-reach_px, reach_px + 1)
-    profiles, inside, lit = _sample(image, field, None, centers, normals, offsets)
-    return Strips(centers, normals, np.ones(len(centers)), profiles, offsets, inside, lit), of
-
-
-def _sample(image, field, view: View | None, centers, normals, offsets, interpolation: int = cv2.INTER_CUBIC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, W) values, (N,) whether the whole strip lies in the field and (N,) whether its middle does."""
-    u, v = places(view, centers, normals, offsets)
-    profiles = cv2.remap(image, u, v, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    u, v = places(centers, normals, offsets)
     ends = [0, len(offsets) // 2, -1]
-    exposed = cv2.remap(field, u[:, ends], v[:, ends], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
-    return profiles, exposed.all(axis=1), exposed[:, 1]
+    exposed = _remap(field, u[:, ends], v[:, ends], cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
+    profiles = _remap(image, u, v, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
+    return Strips(centers, normals, np.ones(len(centers)), profiles, offsets, exposed.all(axis=1), exposed[:, 1]), of
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from fluoro_shape_ros.plausibility import evidence
 from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.strips import Sheet
 from fluoro_shape_ros.tools.families import families
 
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
@@ -119,15 +120,15 @@ def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, monk
 
 
 def test_tracking_goes_on_from_where_the_device_was(scene, found):
-    tracked = track(*prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
+    tracked = track(Sheet.of(*prepared(scene.frame)), RADIUS, 60.0, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
     assert tracked.outcome is Outcome.OK and mean_off(tracked.fit, scene.truth) < 0.08e-3
     for seen, before in zip(tracked.seen_px, found.seen_px):
         assert np.median(cKDTree(before).query(seen)[0]) < 1.5
 
 
 def test_tracking_gives_up_where_the_device_is_not(run, scene):
-    assert track(*prepared(run.without_device()), RADIUS, 60.0, scene.truth) is None
-    assert track(*prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.02, 0.0, 0.0]) is None
+    assert track(Sheet.of(*prepared(run.without_device())), RADIUS, 60.0, scene.truth) is None
+    assert track(Sheet.of(*prepared(scene.frame)), RADIUS, 60.0, scene.truth + [0.02, 0.0, 0.0]) is None
 
 
 def test_explained_is_the_share_of_the_line_near_the_curve(scene, found):

@@ -16,6 +16,7 @@ from fluoro_shape_ros.geometry import source
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.xray import Exposure, transmission
+from fluoro_shape_ros.strips import Sheet
 
 PX = 0.3e-3
 VIEWS = biplane(arm=CArm(pixel_size_iso=PX, width=512, height=512))
@@ -29,7 +30,7 @@ def root(frame):
 
 
 def fitted(frame, start, radius=0.0006):
-    return fit(*root(frame), VIEWS, start, radius)
+    return fit(Sheet.of(*root(frame), VIEWS), start, radius)
 
 
 def nearest(points, truth):
@@ -207,14 +208,14 @@ def test_less_dose_is_known_less_well(run, truth, frame):
 def test_depth_is_known_less_well_between_planes_that_nearly_agree(frame, truth):
     narrow = biplane(angle_b=(np.deg2rad(35), 0.0), arm=CArm(pixel_size_iso=PX, width=512, height=512))
     run = xray_run(0, views=narrow, lengths=(0.06, 0.07), anatomy=False)
-    f = fit(*root(run.scene().frame), narrow, run.backbone(), run.radius)
+    f = fit(Sheet.of(*root(run.scene().frame), narrow), run.backbone(), run.radius)
     assert off(f, run.backbone()).mean() < 0.1e-3
     assert worst_variances(f).mean() > 1.5 * worst_variances(fitted(frame, truth)).mean()
 
 
 def test_nothing_is_fitted_where_both_fields_are_dark(frame, truth):
     images, _ = root(frame)
-    assert fit(images, [np.zeros((512, 512), np.uint8)] * 2, VIEWS, truth, 0.0006) is None
+    assert fit(Sheet.of(images, [np.zeros((512, 512), np.uint8)] * 2, VIEWS), truth, 0.0006) is None
 
 
 @pytest.mark.parametrize('start', ['at a source', 'behind it', 'out and back'])

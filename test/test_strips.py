@@ -3,16 +3,17 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import ndtr
 
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
 from fluoro_shape_ros.profiles import WIDTHS, apparent_width, background, best_of_worst, likeness, mean_profile, odd_width, own_shadow, pieces, shadow
-from fluoro_shape_ros.strips import FOUND_PX, Measurement, Model, Strips, cut, cut_along, half_width_range, measure, search
+from fluoro_shape_ros.strips import FOUND_PX, Measurement, Model, Sheet, Strips, cut, cut_along, half_width_range, measure, search
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -47,7 +48,7 @@ def only(planes):
 
 
 def strips_of(direction, image=None, field=FIELD, view=VIEW, reach=REACH, **drawing):
-    return cut([draw(direction, **drawing) if image is None else image], [field], [view], *line(direction), reach)
+    return cut(Sheet.of([draw(direction, **drawing) if image is None else image], [field], [view]), *line(direction), reach)
 
 
 def measured(strips, on=None):
@@ -126,6 +127,24 @@ def test_speed_is_the_magnification_times_the_sine_of_the_ray():
         middle = slice(95, 105)
         assert_allclose(strips.speed[middle], sine / PX, rtol=3e-3)
         assert_allclose(np.einsum('ni,ni->n', strips.normals[middle], np.gradient(strips.centers_px, axis=0)[middle]), 0, atol=1e-3)
+
+
+def test_a_sheet_samples_each_plane_as_if_it_were_alone():
+    rng = np.random.default_rng(2)
+    images = [rng.random(size, np.float32) for size in ((40, 50), (60, 30))]       # of different sizes
+    fields = [np.full(i.shape, 255, np.uint8) for i in images]
+    fields[1][:10] = 0
+    u, v = (rng.uniform(-8, 68, (2, 25, 7)).astype(np.float32) for _ in range(2))
+    sheet = Sheet.of(images, fields, [VIEW, VIEW])
+    columns, rows = sheet.places(np.stack([u[..., 3], v[..., 3]], axis=2), np.zeros((2, 25, 2)), np.arange(-3, 4))
+    for k in range(2):
+        at = np.repeat(u[k, :, 3:4], 7, axis=1), np.repeat(v[k, :, 3:4], 7, axis=1)
+        alone = cv2.remap(images[k], *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        lit = cv2.remap(fields[k], *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
+        inside = (at[0] > 0) & (at[0] < images[k].shape[1] - 1) & (at[1] > 0) & (at[1] < len(images[k]) - 1)
+        assert inside.any() and not inside.all()
+        assert_allclose(sheet.sample(columns, rows, cv2.INTER_CUBIC)[k][inside], alone[inside], atol=2e-2)     # coordinates are rounded to 1/32 px
+        assert_array_equal(sheet.exposed(columns, rows)[k], lit)
 
 
 def test_strips_follow_a_distorted_image():
