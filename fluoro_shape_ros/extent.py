@@ -14,7 +14,7 @@ GAP_PX = 30
 SMOOTH_PX = 9
 REACH_PX = 12.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
-BLURS_PX = (0.8, 1.2, 1.9)
+BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
 RAMP = 0.1
 DISAGREE_PX = 0.9       # what the planes' ends may differ by, beside noise
@@ -75,7 +75,7 @@ class End:
 
 
 def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray, outward: np.ndarray, beyond: np.ndarray,
-           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX) -> list[End]:
+           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX, blurs_px=BLURS_PX) -> list[End]:
     """Where the device ends, for E ends at once.
 
     s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,) +1 for an end at large s, -1 at
@@ -110,9 +110,9 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     both = e[:, None], np.arange(2)
     model = (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean(axis=1)) ** 2 + (RAMP * ramp) ** 2
     wide = guess[:, None] + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m[:, None]
-    cost, a, z = edges(wide, np.broadcast_to(np.reshape(BLURS_PX, (-1, 1, 1)), (len(BLURS_PX), len(s), 2)))
+    cost, a, z = edges(wide, np.broadcast_to(np.reshape(blurs_px, (-1, 1, 1)), (len(blurs_px), len(s), 2)))
     best = cost.min(axis=3).argmin(axis=0)
-    cost, a, blur = cost[best, *both], a[best, *both], np.array(BLURS_PX)[best]
+    cost, a, blur = cost[best, *both], a[best, *both], np.array(blurs_px)[best]
     lowest = cost.argmin(axis=2)
     seen_sigma = np.sqrt(1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12) + model[:, None])
     fine = wide[e, cost.sum(axis=1).argmin(axis=1)][:, None] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None]

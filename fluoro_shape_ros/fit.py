@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from .curve import arc_length, middle
-from .extent import End, bulge, locate, supported
+from .extent import BLURS_PX, End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
@@ -247,7 +247,7 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])     # it runs out of a field before its end
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
     ends = locate(twice(s), twice(seen.presence), twice(seen.presence_sigma), twice(strips.speed), np.array(reference), OUTWARD,
-                  *_shape_of_end(strips.speed[:, at].T, scale, across, radius))
+                  *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2])
     start_stop = [end.at for end in ends]
     for k in np.nonzero(open_end)[0]:
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
