@@ -48,7 +48,9 @@ def curvature(points: np.ndarray) -> np.ndarray:
 def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The median along an axis, of an even number the upper one of the middle two; several times as fast as NumPy's."""
     k = values.shape[axis] // 2
-    return np.partition(values, k, axis=axis).take(k, axis=axis)
+    parted = values.copy()
+    parted.partition(k, axis=axis)
+    return parted.take(k, axis=axis)
 
 
 def distance_to(points: np.ndarray, line: np.ndarray) -> np.ndarray:

@@ -38,7 +38,8 @@ GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of t
 GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
-HIDDEN_PX = 1.0         # what an end that only one plane shows is worth
+CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
+HIDDEN_PX = 1.0         # what an end is worth that only one plane shows, or that is hard to see in both
 
 
 @dataclass(frozen=True)
@@ -281,6 +282,7 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -
             at[k], sigma[k] = again[k].seen_at[alone[k]], np.hypot(again[k].seen_sigma[alone[k]], HIDDEN_PX * step)
         elif end is not None:
             at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
+            sigma[k] = np.hypot(sigma[k], HIDDEN_PX * step * crowded(f)[k])
     return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma)
 
 
@@ -289,6 +291,11 @@ def seen_alone(f: Fit) -> np.ndarray:
     dark = np.maximum(f.beyond, f.aside)
     hidden = (dark.min(axis=1) < BARE) & (dark.max(axis=1) > HIDES) & (f.beyond.max(axis=1) < CROSSES) & ~f.open_end
     return np.where(hidden, dark.argmin(axis=1), -1)
+
+
+def crowded(f: Fit) -> np.ndarray:
+    """(2,) bool: whether both planes show something beside where the first and the last end would go on."""
+    return f.aside.min(axis=1) > CROWDED
 
 
 def _contrast(profile: np.ndarray) -> float:

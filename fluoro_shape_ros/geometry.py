@@ -18,6 +18,7 @@ from .data import Distortion, View
 MIN_PLANE_ANGLE = np.deg2rad(5.0)   # below it depth is a guess: triangulation errors grow as 1 / sin(angle)
 PARALLEL = np.deg2rad(1.0)          # central rays below it are meant not to meet
 STEREO_SHIFT = 0.25                 # of their width: how far apart the images of a stereo pair show what it looks at
+POINT = 0.02                        # share that counts of what the place of a single point in both planes tells
 
 
 class GeometryError(ValueError):
@@ -107,10 +108,23 @@ def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
     return (P[:2, :3] - (x[..., :2] / x[..., 2:])[..., None] * P[2, :3]) / x[..., 2, None, None]
 
 
-def triangulation_covariance(views: tuple[View, View], X: np.ndarray, sigma_px: float) -> np.ndarray:
-    """(N, 3, 3) m^2 of (N, 3) points that follow from where both planes see them, each to `sigma_px` along u and v."""
-    J = [projection_jacobian(v.P, X) / sigma_px for v in views]
-    return np.linalg.inv(sum(j.transpose(0, 2, 1) @ j for j in J) + np.eye(3))      # nothing is known less well than to a metre
+def calibration_covariance(views: tuple[View, View], X: np.ndarray, T: np.ndarray, sigma_px: float) -> np.ndarray:
+    """(N, 3, 3) m^2 of (N, 3) points of a curve with (N, 3) tangents that planes displaced by `sigma_px` along u and v cause.
+
+    Each plane v shifts the curve by d_v = J_v dX across its projection, and both on average along it:
+    n_v J_v dX = n_v d_v, sum_v t_v (J_v dX - d_v) / |J_v T| = 0, with n_v and t_v across and along the projection. Where the curve runs along epipolar
+    lines that leaves its depth open; there what a point would tell counts a little (POINT).
+    """
+    J = np.stack([projection_jacobian(v.P, X) for v in views])                              # (2, N, 2, 3)
+    step = (J @ T[:, :, None])[..., 0]
+    speed = np.linalg.norm(step, axis=2, keepdims=True) + 1e-9
+    along = step / speed
+    across = np.stack([-along[..., 1], along[..., 0]], axis=2)
+    normal = np.einsum('vnk,vnki->nvi', across, J)                                          # (N, 2, 3)
+    tangential = np.einsum('vnk,vnki->ni', along / speed, J) / np.sqrt((1 / speed**2).sum(axis=0))
+    A = np.concatenate([normal, tangential[:, None]], axis=1)
+    information = A.transpose(0, 2, 1) @ A + POINT * (J.transpose(0, 1, 3, 2) @ J).sum(axis=0)
+    return np.linalg.inv(information + np.eye(3)) * sigma_px**2      # nothing is known less well than to sigma_px metres
 
 
 def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:

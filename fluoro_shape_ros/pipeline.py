@@ -17,7 +17,7 @@ from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
 from .follow import curve, found_near, reach_px
-from .geometry import GeometryError, check, crop, distort, pixels_per_metre, project, triangulation_covariance, undistort
+from .geometry import GeometryError, calibration_covariance, check, crop, distort, pixels_per_metre, project, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .planes import both
@@ -27,7 +27,7 @@ from .strips import Sheet
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
-CALIBRATION_PX = 0.3    # what the best calibration of a plane is worth
+CALIBRATION_PX = 0.25   # what the best calibration of a plane is worth
 
 
 def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconstruction:
@@ -126,13 +126,12 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     along = arc_length(f.spline(u))
     s = even_steps(along[-1], step)
     at = np.interp(s, along, u)
-    basis, = f.spline.bases(at, 0)
-    points = basis @ f.spline.control
+    basis, slope = f.spline.bases(at, 0, 1)
+    points, tangents = basis @ f.spline.control, slope @ f.spline.control
     n = len(f.spline.control)
     half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
-    covariance = np.einsum('iamb,im->iab', half, basis) + triangulation_covariance(views, points, CALIBRATION_PX)
-    tangent = f.spline(at[[0, -1]], 1)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    covariance = np.einsum('iamb,im->iab', half, basis) + calibration_covariance(views, points, tangents, CALIBRATION_PX)
+    tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
     sigma = f.end_sigma if forward else f.end_sigma[::-1]
     covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
     known = [np.isfinite(o) for o in f.offset_px.T]

@@ -7,7 +7,7 @@ import numpy as np
 from .config import Config
 from .curve import curvature, middle
 from .data import Outcome
-from .fit import Fit, contrast_ratio, ends_shown, seen_alone, shown
+from .fit import Fit, contrast_ratio, crowded, ends_shown, seen_alone, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
 MIN_WEAKEST = 0.9      # the same, of the best of the worst pieces in a row
@@ -18,7 +18,9 @@ MAX_BEYOND = 0.6        # darkness past an end, in the plane that shows more: th
 MIN_BEYOND = -0.25      # darkness past an end, in both planes: what is brighter there lies beside something dark, and the device turns aside
 MAX_ASIDE = 0.7         # darkness, in both planes, of a line beside where an end would go on
 TURNED_ASIDE, TURNED_BEYOND = 0.9, -0.3     # both at once, in either plane
-MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane
+MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane ...
+MIN_END_DARK = 0.71     # ... and in both on average, or in the one that alone shows the end: the edge of a bone beyond it is half as dark ...
+MIN_CROWDED_DARK = 0.8  # ... where both planes show something beside it
 MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 BLUNT, BLUNT_PX = 0.35e-3, 1.2          # the same, from which on an end is not clear: then a line beside it by MAX_ASIDE in one plane may be the device's ...
 BARE = 0.05             # ... unless straight on it is at least so dark there
@@ -79,8 +81,10 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
-    alone = (seen_alone(f) >= 0) & (evidence(f) > CERTAIN * np.sqrt(f.stop - f.start))
-    end_shown = np.where(alone, 1.0, ends_shown(f).min(axis=1))
+    speaks = evidence(f) / np.sqrt(f.stop - f.start)
+    alone = (seen_alone(f) >= 0) & (speaks > CERTAIN)
+    each = ends_shown(f)
+    end_shown, end_dark = np.where(alone, 1.0, each.min(axis=1)), np.where(alone, each[[0, 1], seen_alone(f)], each.mean(axis=1))
     for k, name in enumerate(('first', 'last')):
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * px)):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
@@ -91,9 +95,11 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
             return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'
         if end_shown[k] < MIN_END_SHOWN:
             return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
+        if end_dark[k] < (MIN_CROWDED_DARK if crowded(f)[k] else MIN_END_DARK):
+            return Outcome.POORLY_EXPLAINED, f'it fades towards its {name} end: it follows the edge of something there'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
-    if evidence(f) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
+    if speaks < MIN_EVIDENCE:
         return Outcome.POORLY_EXPLAINED, 'too little speaks for it being one device in both planes (likeness, darkness, ends)'
     return None
 

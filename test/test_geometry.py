@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry import (GeometryError, check_pair, check_scale, crop, decompose, depth, distort, epipolar_lines, fundamental, isocenter, make_view,
-                                       pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, triangulation_covariance, undistort)
+from fluoro_shape_ros.geometry import (GeometryError, calibration_covariance, check_pair, check_scale, crop, decompose, depth, distort, epipolar_lines, fundamental,
+                                       isocenter, make_view, pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
 
 K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])
 # plane A looks along +z from z = -1, plane B along +x from x = -1
@@ -30,9 +30,27 @@ def test_jacobian_is_the_derivative_of_project():
     assert_allclose(projection_jacobian(B.P, X[None])[0], numeric, rtol=1e-6)
 
 
-def test_what_a_pixel_is_worth_in_space_by_hand():
-    # at the origin, 1 m from both sources, a px is 1 mm: plane A sees x and y, plane B z and y
-    assert_allclose(triangulation_covariance((A, B), np.zeros((1, 3)), 0.5)[0], np.diag([0.25e-6, 0.125e-6, 0.25e-6]), rtol=1e-5, atol=1e-15)
+def test_what_displaced_planes_do_to_a_curve_by_hand():
+    # at the origin, 1 m from both sources, a px is 1 mm. A curve along y: plane A shifts it along x, plane B along z, both together along y
+    found = calibration_covariance((A, B), np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), 0.5)[0]
+    assert_allclose(found, np.diag([0.25e-6, 0.125e-6, 0.25e-6]), rtol=0.06, atol=1e-12)
+
+
+def test_displaced_planes_shift_a_slanting_curve_by_as_much_as_it_takes_to_see_it_there():
+    tangent, rng, sigma_px = np.array([0.5, 1.0, 0.6]), np.random.default_rng(1), 0.5
+    Ja, Jb = (projection_jacobian(P, np.zeros((1, 3)))[0] for P in (A.P, B.P))
+    moved = []
+    for da, db in rng.normal(0, sigma_px, (4000, 2, 2)):
+        rows, seen, ends = [], [], []
+        for J, d in ((Ja, da), (Jb, db)):
+            step = J @ tangent
+            n, t = np.array([-step[1], step[0]]) / np.linalg.norm(step), step / (step @ step)
+            rows.append(n @ J)
+            seen.append(n @ d)
+            ends.append((t @ J, t @ d))         # in units of the tangent
+        moved.append(np.linalg.solve([*rows, ends[0][0] + ends[1][0]], [*seen, ends[0][1] + ends[1][1]]))
+    found = calibration_covariance((A, B), np.zeros((1, 3)), tangent[None], sigma_px)[0]
+    assert_allclose(np.sqrt(np.linalg.eigvalsh(found)), np.sqrt(np.linalg.eigvalsh(np.cov(np.array(moved).T))), rtol=0.06)
 
 
 @pytest.mark.parametrize('distortion', [None, Distortion('plumb_bob', K, np.array([0.3, -0.1, 0.001, 0.002, 0.0]), np.eye(3))])

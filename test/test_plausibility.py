@@ -83,7 +83,15 @@ def hidden(first, last, plane):
     return presence
 
 
+def faded(to):
+    """Presence of the device that is only so dark in both planes over its last 8 mm."""
+    presence = device().presence.copy()
+    presence[(S > 0.052) & (S < 0.06)] = to
+    return presence
+
+
 def test_a_clear_device_raises_no_doubt():
+    assert doubt(device(presence=faded(0.75)), MIN_LENGTH_PX) is None
     assert doubt(device(), MIN_LENGTH_PX) is None
     enters = dict(open_end=np.array([True, False]), beyond=np.array([[1.0, 0.0], [0, 0]]))
     assert doubt(device(presence=hidden(0.03, 0.04, 1), **enters), MIN_LENGTH_PX) is None
@@ -107,6 +115,8 @@ def test_a_clear_device_raises_no_doubt():
     (dict(aside=np.array([[0.0, 0.9], [0.9, 0.8]])), Outcome.POORLY_EXPLAINED, 'last end'),
     (dict(end_sigma=np.array([5e-5, 5e-4]), aside=np.array([[0.0, 0.0], [0.0, 0.9]])), Outcome.POORLY_EXPLAINED, 'last end is not clear'),
     (dict(presence=hidden(0.055, 0.07, 1)), Outcome.DIRECTIONS_DISAGREE, 'last end'),
+    (dict(presence=faded(0.6)), Outcome.POORLY_EXPLAINED, 'fades towards its last end'),
+    (dict(presence=faded(0.75), aside=np.array([[0.0, 0.0], [0.5, 0.45]])), Outcome.POORLY_EXPLAINED, 'fades towards its last end'),
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
 ])
 def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
