@@ -14,7 +14,7 @@ from .data import Outcome
 from .fit import COARSE, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
-from .plausibility import alike_device, blunt, clear, doubt, evidence
+from .plausibility import alike_device, blunt, clear, doubt, evidence, in_one_plane
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
 from .strips import Sheet, cut_along, half_width_range
@@ -68,6 +68,11 @@ class Attempt:
         return self.weight > CONVINCING * np.sqrt(self.fit.stop - self.fit.start)
 
     @property
+    def believed(self) -> bool:
+        """Whether it needs no other attempt beside it."""
+        return self.convincing and not self.doubt and (in_one_plane(self.fit) < 0).all()
+
+    @property
     def promising(self) -> bool:
         return self.weight > PROMISING * np.sqrt(self.fit.stop - self.fit.start)
 
@@ -101,14 +106,19 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     tried, settled = [], None
     for attempt in attempts((start for start in _pairs(views, candidates) if settled is None or start[1] == settled.lines), 1):
         tried.append(attempt)
-        if settled is None and attempt.convincing and not attempt.doubt:
+        if settled is None and attempt.believed:
             settled = attempt       # but for the same lines read the other way round
     if not tried:
         return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
     chosen = max(tried, key=lambda t: t.weight)
-    if not chosen.convincing or chosen.doubt:       # who tries often must ask for more: clear ends too
-        more = attempts(_again(images, fields, views, candidates, widths, tried), 2)
-        chosen = next((t for t in more if t.convincing and not blunt(t.fit).any() and not t.doubt), chosen)
+    if not chosen.believed:       # who tries often must ask for more: clear ends too
+        more = []
+        for attempt in attempts(_again(images, fields, views, candidates, widths, tried), 2):
+            more.append(attempt)
+            if attempt.believed and not blunt(attempt.fit).any():
+                break
+        good = [t for t in more if t.convincing and not t.doubt and not blunt(t.fit).any()]
+        chosen = max(good, key=lambda t: (t.believed, t.weight), default=chosen)
     others = [t for t in tried if t.weight > RIVAL * chosen.weight and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
     if others:      # lines along epipolar lines: only the ends tell which way round they belong together
         chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
@@ -166,7 +176,9 @@ def _projected(f: Fit, view) -> np.ndarray:
 def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
     fitted = fit(sheet, points, radius, coarse=1)
-    if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
+    if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or (in_one_plane(fitted) >= 0).any():
+        return None
+    if evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
         return None
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views))
 

@@ -30,7 +30,7 @@ CLEARER = 2.0           # ... so that this many times as much speaks for a fit w
 CLEAR_LIKENESS, CLEAR_WEAKEST = 0.93, 0.85
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see `evidence`, for a length of 1 m
-CERTAIN = 0.6           # the same, for a fit with an end that only one plane shows
+CERTAIN, CERTAIN_WEAKEST = 0.6, 0.95    # the same, and the least likeness in a row, of a fit with an end that only one plane shows
 CONTRAST_RATIO = 0.3    # natural logarithm: planes differ in energy and scatter
 UNLIKE = 0.05           # a correlation less by this than 1 makes a profile e times less likely the device's
 ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less likely the device
@@ -62,6 +62,11 @@ def clear(f: Fit) -> bool:
     return not f.open_end.any() and f.end_sigma.max() < max(CLEAR, CLEAR_PX * (f.s[1] - f.s[0])) and f.beyond.max() < CLEAR_BEYOND
 
 
+def in_one_plane(f: Fit) -> np.ndarray:
+    """(2,) the plane by which alone the first and the last end are known, see `seen_alone`; -1 for one that both planes see, in spite of the line."""
+    return np.full(2, -1) if clear(f) else seen_alone(f)
+
+
 def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     """Whether what both planes show along a fitted curve is one device of at least `min_length_px`: None, or the rejection."""
     px = f.s[1] - f.s[0]    # m
@@ -81,10 +86,11 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
-    speaks = evidence(f) / np.sqrt(f.stop - f.start)
-    alone = (seen_alone(f) >= 0) & (speaks > CERTAIN)
-    each = ends_shown(f)
-    end_shown, end_dark = np.where(alone, 1.0, each.min(axis=1)), np.where(alone, each[[0, 1], seen_alone(f)], each.mean(axis=1))
+    speaks, each, by = evidence(f) / np.sqrt(f.stop - f.start), ends_shown(f), in_one_plane(f)
+    alone = by >= 0
+    if alone.any() and (speaks < CERTAIN or f.weakest.min() < CERTAIN_WEAKEST):
+        return Outcome.POORLY_EXPLAINED, 'a line hides one of its ends in one plane, and too little else speaks for it'
+    end_dark = np.where(alone, each[[0, 1], by], each.mean(axis=1))
     for k, name in enumerate(('first', 'last')):
         if not f.open_end[k] and (f.beyond[k].max() > MAX_BEYOND or f.end_sigma[k] > max(MAX_END_SIGMA, MAX_END_PX * px)):
             return Outcome.DIRECTIONS_DISAGREE, f'the planes disagree where its {name} end lies'
@@ -93,7 +99,7 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
             return Outcome.POORLY_EXPLAINED, f'it turns aside at its {name} end and could not be followed'
         if blunt(f)[k] and ((f.aside[k] > MAX_ASIDE) & (f.beyond[k] < BARE)).any():
             return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'
-        if end_shown[k] < MIN_END_SHOWN:
+        if each[k].min() < MIN_END_SHOWN:
             return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
         if end_dark[k] < (MIN_CROWDED_DARK if crowded(f)[k] else MIN_END_DARK):
             return Outcome.POORLY_EXPLAINED, f'it fades towards its {name} end: it follows the edge of something there'
