@@ -14,7 +14,7 @@ from .data import Outcome
 from .fit import COARSE, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
-from .plausibility import alike_device, blunt, clear, doubt, evidence, in_one_plane
+from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence, in_one_plane
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
 from .strips import Sheet, cut_along, half_width_range
@@ -68,6 +68,11 @@ class Attempt:
         return self.weight > CONVINCING * np.sqrt(self.fit.stop - self.fit.start)
 
     @property
+    def plain(self) -> float:
+        """The weight without what clear ends add: of two curves by the same lines one may have them by chance."""
+        return self.weight / (CLEARER if clear(self.fit) else 1.0)
+
+    @property
     def believed(self) -> bool:
         """Whether it needs no other attempt beside it."""
         return self.convincing and not self.doubt and (in_one_plane(self.fit) < 0).all()
@@ -119,7 +124,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
                 break
         good = [t for t in more if t.convincing and not t.doubt and not blunt(t.fit).any()]
         chosen = max(good, key=lambda t: (t.believed, t.weight), default=chosen)
-    others = [t for t in tried if t.weight > RIVAL * chosen.weight and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
+    others = [t for t in tried if t.plain > RIVAL * chosen.plain and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
     if others:      # lines along epipolar lines: only the ends tell which way round they belong together
         chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
         if second.fit.end_sigma.max() < SHARPER * chosen.fit.end_sigma.max():

@@ -13,7 +13,7 @@ from fluoro_shape_ros.data import Outcome
 from fluoro_shape_ros.fit import Fit, contrast_ratio, seen_alone, shown
 from fluoro_shape_ros.pipeline import CALIBRATION_PX, reconstruct
 from fluoro_shape_ros.plausibility import (blunt, check_curvature, check_length, check_reprojection, check_tip, clear, curvature_limit, doubt,
-                                           evidence)
+                                           evidence, in_one_plane)
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
@@ -155,8 +155,9 @@ def test_ends_are_clear_only_together(other):
 def test_an_end_that_a_line_hides_in_one_plane_is_seen_by_the_other_alone():
     crossed = dict(aside=np.array([[0.0, 0.1], [0.9, 0.1]]), beyond=np.array([[0.0, 0.0], [0.3, -0.1]]))
     assert seen_alone(device(**crossed)).tolist() == [-1, 1]
-    assert doubt(device(**crossed, presence=hidden(0.055, 0.07, 0)), MIN_LENGTH_PX) is None
-    assert 'only one plane' in doubt(device(presence=hidden(0.055, 0.07, 0)), MIN_LENGTH_PX)[1]
+    assert doubt(device(**crossed), MIN_LENGTH_PX) is None
+    assert 'a line hides' in doubt(device(**crossed | dict(weakest=np.array([0.92, 0.98]))), MIN_LENGTH_PX)[1]
+    assert in_one_plane(device(**crossed)).tolist() == [-1, 1] and in_one_plane(device(**crossed, **CLEAR)).tolist() == [-1, -1]
 
 
 @pytest.mark.parametrize('aside, beyond', [([0.9, 0.5], [0.3, 0.0]), ([0.5, 0.1], [0.3, 0.0]), ([0.9, 0.1], [0.7, 0.0]), ([0.9, 0.1], [0.3, 0.4])],
