@@ -14,7 +14,7 @@ from .data import Outcome
 from .fit import COARSE, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
-from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence, in_one_plane
+from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
 from .strips import Sheet, cut_along, half_width_range
@@ -75,24 +75,23 @@ class Attempt:
     @property
     def believed(self) -> bool:
         """Whether it needs no other attempt beside it."""
-        return self.convincing and not self.doubt and (in_one_plane(self.fit) < 0).all()
+        return self.convincing and not self.doubt and (self.fit.alone < 0).all()
 
     @property
     def promising(self) -> bool:
         return self.weight > PROMISING * np.sqrt(self.fit.stop - self.fit.start)
 
 
-def detect(images, fields, views, radius: float, min_length_px: float) -> Detection:
-    """Search both whole images (H, W float32, dark device) for the device of `radius` m."""
+def detect(sheet: Sheet, radius: float, min_length_px: float) -> Detection:
+    """Search both whole images (dark device, even noise) for the device of `radius` m."""
+    views = sheet.views
     center = isocenter(views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in views]
-    candidates = [candidates_of(*plane, min_length_px) for plane in zip(images, fields, widths)]
+    candidates = [candidates_of(*plane, min_length_px) for plane in zip(sheet.planes, sheet.fields, widths)]
     best = tuple(c[0].points_px if c else None for c in candidates)
     for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if not found:
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
-
-    sheet = Sheet.of(images, fields, views)
 
     def attempts(starts, times: int) -> Iterator[Attempt]:
         """Fits, each as often again from where it came to lie: a start some px off may catch on another line where the next does not."""
@@ -118,7 +117,7 @@ def detect(images, fields, views, radius: float, min_length_px: float) -> Detect
     chosen = max(tried, key=lambda t: t.weight)
     if not chosen.believed:       # who tries often must ask for more: clear ends too
         more = []
-        for attempt in attempts(_again(images, fields, views, candidates, widths, tried), 2):
+        for attempt in attempts(_again(sheet, candidates, widths, tried), 2):
             more.append(attempt)
             if attempt.believed and not blunt(attempt.fit).any():
                 break
@@ -147,12 +146,12 @@ def _pairs(views, candidates) -> Iterator[Start]:
         yield first_curve(views, curves[0][a], curves[1][b], alignment), (candidates[0][a], candidates[1][b]), 0
 
 
-def _again(images, fields, views, candidates, widths, tried: list[Attempt]) -> Iterator[Start]:
+def _again(sheet: Sheet, candidates, widths, tried: list[Attempt]) -> Iterator[Start]:
     """Where else it may be, when no pair of lines settled it: where the likeliest fits came to lie; where the other plane shows what one plane's line
     alone says; and the likeliest again with a search around their starts."""
     likeliest = sorted((t for t in tried if t.promising), key=lambda t: -t.weight)[:AGAIN]
     yield from ((_curve(attempt.fit), attempt.lines, 0) for attempt in likeliest)
-    dark = [darkness(*plane) for plane in zip(images, fields, widths)]
+    views, dark = sheet.views, [darkness(*plane) for plane in zip(sheet.planes, sheet.fields, widths)]
     paths = []
     for k, (view, found) in enumerate(zip(views, candidates)):
         for c in found[:SWEPT]:
@@ -178,10 +177,10 @@ def _projected(f: Fit, view) -> np.ndarray:
     return distort(view, project(view.P, f.spline(np.linspace(f.start, f.stop, 100))))
 
 
-def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray) -> Detection | None:
+def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, **how) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
-    fitted = fit(sheet, points, radius, coarse=1)
-    if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or (in_one_plane(fitted) >= 0).any():
+    fitted = fit(sheet, points, radius, **dict(coarse=1) | how)
+    if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or (fitted.alone >= 0).any():
         return None
     if evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
         return None

@@ -23,9 +23,9 @@ COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 LONGEST_PX = 16000      # OpenCV samples 32767 rows at once: the strips of both planes
 COARSE_STEP = 3         # px between the strips of a coarse round
-SETTLED_PX = 0.08       # a fine round that moves the curve less is the last
+SETTLED_PX = 0.15        # a fine round that moves the curve less is the last: strips tell offsets so small exactly
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
-EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked
+EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked at once
 NEAR_END_PX = 8
 GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
@@ -39,7 +39,7 @@ GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in eithe
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
 CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
-HIDDEN_PX = 1.0         # what an end is worth that only one plane shows, or that is hard to see in both
+HARD_PX = 1.0           # what an end is worth that only one plane shows, or that is hard to see in both
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,13 @@ class Fit:
     weakest: np.ndarray         # (2,) the same where it looks least like one, see profiles.best_of_worst
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
+    alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
 
 
-def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE) -> Fit | None:
+def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE, beyond_px: float = EXTENSION_PX) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
-    radius: of the device, m. coarse: rounds that search for it a few px around.
+    radius: of the device, m. coarse: rounds that search for it a few px around. beyond_px: how far past both ends is looked at once.
     """
     views = sheet.views
     scale = [pixels_per_metre(v.P, points) for v in views]
@@ -76,7 +77,7 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE) -
     if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
         return None     # it goes to a source
     pair = _Pair.of(sheet, half_width, step)
-    seen = pair.settle(through(points, EXTENSION_PX * step), (0.0, arc_length(points)[-1]), coarse, FINE)
+    seen = pair.settle(through(points, beyond_px * step), (0.0, arc_length(points)[-1]), coarse, FINE)
     if seen is None:
         return None
     seen, aside = pair.grow(seen)
@@ -208,8 +209,8 @@ class _Pair:
 def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
     """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough to say where it ends."""
     rows = []
-    for end, alone in zip(ends, seen_alone(f)):
-        if end is not None and alone < 0 and np.isfinite(end.seen_at).all():
+    for end, by in zip(ends, _shown_by_one(f)):
+        if end is not None and by < 0 and np.isfinite(end.seen_at).all():
             row = EndRow.of(f.spline, end.at, end.seen_at, end.seen_sigma, views)
             known = row.row @ f.covariance @ row.row
             if known > UNKNOWN * row.variance and row.target**2 < SURPRISE * (known + row.variance):
@@ -255,7 +256,7 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-               contrast, across, width, odd, alike, weakest, np.nan_to_num(found.beyond), np.where(open_end[:, None], 0.0, aside)), ends
+               contrast, across, width, odd, alike, weakest, np.nan_to_num(found.beyond), np.where(open_end[:, None], 0.0, aside), np.full(2, -1)), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -266,9 +267,9 @@ def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, r
 
 def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
-    scale, step, alone = np.array(half_width) / radius, f.s[1] - f.s[0], seen_alone(f)
-    hidden = np.array([end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed(1 / step) for end, v in zip(ends, alone)])
-    at = np.array([end.seen_at[v] if h else x for end, h, v, x in zip(ends, hidden, alone, (f.start, f.stop))])
+    scale, step, by = np.array(half_width) / radius, f.s[1] - f.s[0], _shown_by_one(f)
+    alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed(1 / step) else -1 for end, v in zip(ends, by)])
+    at = np.array([x if v < 0 else end.seen_at[v] for end, v, x in zip(ends, alone, (f.start, f.stop))])
     window = np.arange(-END_WINDOW_PX, END_WINDOW_PX + END_STEP_PX, END_STEP_PX) * step
     s = at[:, None] + window
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
@@ -276,18 +277,18 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -
     there = speed[:, :, len(window) // 2]
     again = locate(s, presence, seen.presence_sigma.reshape(2, 2).T, speed, at, OUTWARD, *_shape_of_end(there, scale, f.across, radius),
                    density=1 / END_STEP_PX, reach_px=END_REACH_PX)
-    sigma = np.zeros(2)
-    for k, end in enumerate(ends):
-        if hidden[k] and np.isfinite(again[k].seen_at[alone[k]]):
-            at[k], sigma[k] = again[k].seen_at[alone[k]], np.hypot(again[k].seen_sigma[alone[k]], HIDDEN_PX * step)
+    hard, sigma = crowded(f), np.zeros(2)
+    for k, (end, v) in enumerate(zip(ends, alone)):
+        if v >= 0 and np.isfinite(again[k].seen_at[v]):
+            at[k], sigma[k], hard[k] = again[k].seen_at[v], again[k].seen_sigma[v], True
         elif end is not None:
             at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
-            sigma[k] = np.hypot(sigma[k], HIDDEN_PX * step * crowded(f)[k])
-    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma)
+    sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
+    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone)
 
 
-def seen_alone(f: Fit) -> np.ndarray:
-    """(2,) the plane that alone shows the first and the last end, because a line that crosses the device there hides it in the other; -1 where there is none."""
+def _shown_by_one(f: Fit) -> np.ndarray:
+    """(2,) the plane that shows the first and the last end well where a line that crosses the device may hide it in the other; -1 where there is none."""
     dark = np.maximum(f.beyond, f.aside)
     hidden = (dark.min(axis=1) < BARE) & (dark.max(axis=1) > HIDES) & (f.beyond.max(axis=1) < CROSSES) & ~f.open_end
     return np.where(hidden, dark.argmin(axis=1), -1)

@@ -44,7 +44,7 @@ def found_near(sheet: Sheet, config: Config, guess: Guess) -> Detection | None:
     start = follow(sheet, guess, config.detection.robot_radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = track(sheet, config.detection.robot_radius, config.detection.min_length_px, start)
+    found = track(sheet, config.detection.robot_radius, config.detection.min_length_px, start, coarse=1, beyond_px=48.0)
     if found is None:
         return None
     f = found.fit

@@ -58,7 +58,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
         found = _near(around, found_near, images, fields, frame.views, polarity, config, guess) or found
         clock.lap('follow')
     if found is None:
-        found = detect(both(stable_noise, images, [polarity] * 2), fields, frame.views, radius, config.detection.min_length_px)
+        found = detect(_sheet(images, fields, frame.views, polarity), radius, config.detection.min_length_px)
         clock.lap('detect')
     seen = tuple(None if px is None else Centerline(px) for px in found.seen_px)
     if found.fit is None:
@@ -154,20 +154,28 @@ def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
     return full - image if polarity == 'bright' else image
 
 
-def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice] = (slice(None), slice(None))) -> np.ndarray:
-    """Float32 square root of the `region` of a dark device's (H, W) image: quantum noise gets the same variance everywhere (Anscombe)."""
-    if image.dtype.kind == 'u' and polarity != 'auto':
-        dark = dark_device(image[region], polarity)
+def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice], out: np.ndarray) -> None:
+    """Write the square root of the `region` of a dark device's (H, W) image to `out`, float32: quantum noise gets the same variance everywhere (Anscombe)."""
+    if image.dtype.kind == 'u' and polarity == 'dark':
+        np.sqrt(image[region], out=out, dtype=np.float32)
+    elif image.dtype.kind == 'u' and polarity != 'auto':
+        np.sqrt(dark_device(image[region], polarity), out=out)
     else:       # needs the whole image's statistics
-        dark = dark_device(image, polarity)[region]
-    return np.sqrt(dark, out=dark)
+        np.sqrt(dark_device(image, polarity)[region], out=out)
+
+
+WHOLE = slice(None), slice(None)
+
+
+def _sheet(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Sheet:
+    """Both planes' images, or a region of each, as the method wants them."""
+    parts = [crop(v, *r) for v, r in zip(views, regions)] if regions != (WHOLE, WHOLE) else views
+    return Sheet.of(list(zip(images, regions)), [f[r] for f, r in zip(fields, regions)], parts, lambda i, out: stable_noise(i[0], polarity, i[1], out))
 
 
 def _near(regions, look, images, fields, views, polarity: str, *known) -> Detection | None:
     """What `look` finds in these regions of both planes; None where it finds nothing, or something that may go on beyond them."""
-    sheet = Sheet.of([stable_noise(i, polarity, r) for i, r in zip(images, regions)], [f[r] for f, r in zip(fields, regions)],
-                     [crop(v, *r) for v, r in zip(views, regions)])
-    found = look(sheet, *known)
+    found = look(_sheet(images, fields, views, polarity, regions), *known)
     if found is None:
         return None
     seen = []

@@ -7,7 +7,7 @@ import numpy as np
 from .config import Config
 from .curve import curvature, middle
 from .data import Outcome
-from .fit import Fit, contrast_ratio, crowded, ends_shown, seen_alone, shown
+from .fit import Fit, contrast_ratio, crowded, ends_shown, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
 MIN_WEAKEST = 0.9      # the same, of the best of the worst pieces in a row
@@ -62,11 +62,6 @@ def clear(f: Fit) -> bool:
     return not f.open_end.any() and f.end_sigma.max() < max(CLEAR, CLEAR_PX * (f.s[1] - f.s[0])) and f.beyond.max() < CLEAR_BEYOND
 
 
-def in_one_plane(f: Fit) -> np.ndarray:
-    """(2,) the plane by which alone the first and the last end are known, see `seen_alone`; -1 for one that both planes see, in spite of the line."""
-    return np.full(2, -1) if clear(f) else seen_alone(f)
-
-
 def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     """Whether what both planes show along a fitted curve is one device of at least `min_length_px`: None, or the rejection."""
     px = f.s[1] - f.s[0]    # m
@@ -86,7 +81,7 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
-    speaks, each, by = evidence(f) / np.sqrt(f.stop - f.start), ends_shown(f), in_one_plane(f)
+    speaks, each, by = evidence(f) / np.sqrt(f.stop - f.start), ends_shown(f), f.alone
     alone = by >= 0
     if alone.any() and (speaks < CERTAIN or f.weakest.min() < CERTAIN_WEAKEST):
         return Outcome.POORLY_EXPLAINED, 'a line hides one of its ends in one plane, and too little else speaks for it'

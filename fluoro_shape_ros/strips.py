@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from .curve import middle
 from .data import View
 from .geometry import distort
+from .planes import both
 
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
@@ -62,20 +63,29 @@ class Sheet:
     field: np.ndarray       # (H, W) uint8
     top: np.ndarray         # (V, 1, 1) float32, row where each plane begins
     heights: np.ndarray     # (V, 1, 1) float32
+    planes: Sequence[np.ndarray]    # V (H, W) float32, parts of `image`
+    fields: Sequence[np.ndarray]    # V (H, W) uint8
     views: Sequence[View]
 
     @classmethod
-    def of(cls, images, fields, views) -> Sheet:
-        """From V (H, W) float32 images (dark device) and uint8 fields. Around each lie MARGIN_PX rows of its own border, exposed nowhere."""
-        heights, width = np.array([len(i) for i in images]), max(i.shape[1] for i in images)
-        below = np.cumsum(heights + 2 * MARGIN_PX)
-        image, field = np.empty((below[-1], width), np.float32), np.empty((below[-1], width), np.uint8)
-        for rows, i, f in zip(map(slice, below - heights - 2 * MARGIN_PX, below), images, fields):
-            beside = MARGIN_PX, MARGIN_PX, 0, width - i.shape[1]
-            cv2.copyMakeBorder(i, *beside, cv2.BORDER_REPLICATE, dst=image[rows])
-            cv2.copyMakeBorder(f, *beside, cv2.BORDER_CONSTANT, dst=field[rows], value=0)
+    def of(cls, images, fields, views, draw=lambda image, out: np.copyto(out, image)) -> Sheet:
+        """From V images (of a dark device) and their (H, W) uint8 fields; `draw` writes one to an (H, W) float32 array.
+
+        Around each lie MARGIN_PX rows of its own border, exposed nowhere.
+        """
+        heights, width = np.array([len(f) for f in fields]), max(f.shape[1] for f in fields)
+        top = np.cumsum(heights + 2 * MARGIN_PX) - heights - MARGIN_PX
+        whole = np.empty((top[-1] + heights[-1] + MARGIN_PX, width), np.float32)
+        exposed = np.zeros(whole.shape, np.uint8)
+        planes = [whole[t:t + len(f), :f.shape[1]] for t, f in zip(top, fields)]
+        both(draw, images, planes)
+        for t, plane, f in zip(top, planes, fields):
+            h, w = f.shape
+            exposed[t:t + h, :w] = f
+            whole[t:t + h, w:] = plane[:, -1:]
+            whole[t - MARGIN_PX:t], whole[t + h:t + h + MARGIN_PX] = whole[t], whole[t + h - 1]
         column = lambda x: x[:, None, None].astype(np.float32)      # noqa: E731
-        return cls(image, field, column(below - heights - MARGIN_PX), column(heights), views)
+        return cls(whole, exposed, column(top), column(heights), planes, fields, views)
 
     def places(self, centers: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(V, N, W) float32 column and row of the samples of N strips at (W,) offsets."""

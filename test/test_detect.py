@@ -27,8 +27,8 @@ MIN_LENGTH = 60.0
 
 
 def prepared(frame):
-    """What the pipeline hands on: square roots of the counts, fields, views."""
-    return [np.sqrt(i.astype(np.float32)) for i in frame.images], [field_of_view(i) for i in frame.images], frame.views
+    """What the pipeline hands on: square roots of the counts, with fields and views."""
+    return Sheet.of([np.sqrt(i.astype(np.float32)) for i in frame.images], [field_of_view(i) for i in frame.images], frame.views)
 
 
 def mean_off(f, truth):
@@ -47,7 +47,7 @@ def scene(run):
 
 @pytest.fixture(scope='module')
 def found(scene):
-    return detect(*prepared(scene.frame), RADIUS, MIN_LENGTH)
+    return detect(prepared(scene.frame), RADIUS, MIN_LENGTH)
 
 
 def test_the_device_is_found_in_front_of_anatomy(scene, found):
@@ -65,7 +65,8 @@ def test_what_was_seen_lies_on_the_device(scene, found):
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_the_device_is_among_the_best_candidates_of_either_image(seed):
     scene = xray_run(seed, views=VIEWS, lengths=(0.06, 0.08)).scene()
-    for image, field, view in zip(*prepared(scene.frame)):
+    sheet = prepared(scene.frame)
+    for image, field, view in zip(sheet.planes, sheet.fields, sheet.views):
         candidates = candidates_of(image, field, HALF_WIDTH, MIN_LENGTH)
         assert all(0 < c.score <= 1 for c in candidates)
         true = cKDTree(project(view.P, scene.truth))
@@ -87,7 +88,7 @@ def test_without_a_device_the_plane_is_named(run, scene):
     there, gone = plain.scene().frame, plain.without_device()
     for images, outcome in (((gone.images[0], there.images[1]), Outcome.NO_DEVICE_A), ((there.images[0], gone.images[1]), Outcome.NO_DEVICE_B),
                             (gone.images, Outcome.NO_DEVICE_A)):
-        result = detect(*prepared(replace(there, images=images)), RADIUS, MIN_LENGTH)
+        result = detect(prepared(replace(there, images=images)), RADIUS, MIN_LENGTH)
         assert result.fit is None and result.outcome is outcome and result.detail
         assert (result.seen_px[0] is None) == (outcome is Outcome.NO_DEVICE_A)
 
@@ -95,14 +96,14 @@ def test_without_a_device_the_plane_is_named(run, scene):
 def test_lines_that_share_no_epipolar_lines_do_not_correspond():
     plain = xray_run(1, views=VIEWS, lengths=(0.06, 0.08), anatomy=False).scene().frame
     rolled = np.roll(plain.images[1], 230, axis=0)      # the device stands nearly half the image lower there
-    result = detect(*prepared(replace(plain, images=(plain.images[0], rolled))), RADIUS, MIN_LENGTH)
+    result = detect(prepared(replace(plain, images=(plain.images[0], rolled))), RADIUS, MIN_LENGTH)
     assert result.outcome is not Outcome.OK and result.fit is None
 
 
 def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, monkeypatch):
     def mixed(image, field, *rest):
         """In plane a the device; in plane b its first half, going on straight as a lead might."""
-        k = next(k for k, i in enumerate(images) if i is image)
+        k = next(k for k, i in enumerate(sheet.planes) if i is image)
         line = project(VIEWS[k].P, scene.truth)
         if k == 1:
             half = len(line) // 2
@@ -111,24 +112,24 @@ def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, monk
         line = at_arc_length(line, np.arange(0, arc_length(line)[-1]))
         return [Candidate(line, np.ones(len(line)), 0.9)]
 
-    images, fields, views = prepared(scene.frame)
+    sheet = prepared(scene.frame)
     monkeypatch.setattr('fluoro_shape_ros.detect.candidates_of', mixed)
-    result = detect(images, fields, views, RADIUS, MIN_LENGTH)
+    result = detect(sheet, RADIUS, MIN_LENGTH)
     assert result.outcome is Outcome.OK and mean_off(result.fit, scene.truth) < 0.08e-3
     ends = result.fit.spline(np.array([result.fit.start, result.fit.stop]))
     assert cKDTree(ends).query(scene.truth[[0, -1]])[0].max() < 0.4e-3
 
 
 def test_tracking_goes_on_from_where_the_device_was(scene, found):
-    tracked = track(Sheet.of(*prepared(scene.frame)), RADIUS, 60.0, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
+    tracked = track(prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
     assert tracked.outcome is Outcome.OK and mean_off(tracked.fit, scene.truth) < 0.08e-3
     for seen, before in zip(tracked.seen_px, found.seen_px):
         assert np.median(cKDTree(before).query(seen)[0]) < 1.5
 
 
 def test_tracking_gives_up_where_the_device_is_not(run, scene):
-    assert track(Sheet.of(*prepared(run.without_device())), RADIUS, 60.0, scene.truth) is None
-    assert track(Sheet.of(*prepared(scene.frame)), RADIUS, 60.0, scene.truth + [0.02, 0.0, 0.0]) is None
+    assert track(prepared(run.without_device()), RADIUS, 60.0, scene.truth) is None
+    assert track(prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.02, 0.0, 0.0]) is None
 
 
 def test_explained_is_the_share_of_the_line_near_the_curve(scene, found):

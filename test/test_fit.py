@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from fluoro_shape_ros.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Frame
 from fluoro_shape_ros.field import field_of_view
-from fluoro_shape_ros.fit import fit, seen_alone, shown
+from fluoro_shape_ros.fit import fit, shown
 from fluoro_shape_ros.geometry import source
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
@@ -137,7 +137,7 @@ def test_an_end_that_another_line_hides_in_one_plane_is_where_the_other_shows_it
     aside = np.cross(tangent, [1.0, 0.0, 0.0])
     lead = truth[-1] + np.linspace(-0.03, 0.03, 300)[:, None] * (aside / np.linalg.norm(aside) + slant * tangent)
     f = fitted(photographed(truth, [(lead, (plane == 0, plane == 1))]), truth)
-    assert seen_alone(f).tolist() == [-1, 1 - plane]
+    assert f.alone.tolist() == [-1, 1 - plane]
     assert_allclose(ends(f), truth[[0, -1]], atol=0.3e-3)
     assert 0.2e-3 < f.end_sigma[1] < 0.35e-3
 

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
-from fluoro_shape_ros.fit import Fit, contrast_ratio, seen_alone, shown
+from fluoro_shape_ros.fit import Fit, contrast_ratio, shown
 from fluoro_shape_ros.pipeline import CALIBRATION_PX, reconstruct
 from fluoro_shape_ros.plausibility import (blunt, check_curvature, check_length, check_reprojection, check_tip, clear, curvature_limit, doubt,
-                                           evidence, in_one_plane)
+                                           evidence)
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
@@ -72,7 +72,7 @@ def device(**other):
     clear = dict(spline=straight, start=0.0, stop=0.06, end_sigma=np.full(2, 2e-4), open_end=np.array([False, False]),
                  covariance=np.eye(30) * 1e-10, s=S, presence=present, offset_px=np.zeros((len(S), 2)),
                  contrast=np.array([0.25, 0.25]), across=np.array([0.25, 0.25]), width=0.9, odd_width=0.0,
-                 likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)))
+                 likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)), alone=np.full(2, -1))
     return Fit(**clear | other)
 
 
@@ -152,19 +152,12 @@ def test_ends_are_clear_only_together(other):
     assert_allclose(evidence(device(**CLEAR)), 2 * evidence(device()))
 
 
-def test_an_end_that_a_line_hides_in_one_plane_is_seen_by_the_other_alone():
-    crossed = dict(aside=np.array([[0.0, 0.1], [0.9, 0.1]]), beyond=np.array([[0.0, 0.0], [0.3, -0.1]]))
-    assert seen_alone(device(**crossed)).tolist() == [-1, 1]
-    assert doubt(device(**crossed), MIN_LENGTH_PX) is None
-    assert 'a line hides' in doubt(device(**crossed | dict(weakest=np.array([0.92, 0.98]))), MIN_LENGTH_PX)[1]
-    assert in_one_plane(device(**crossed)).tolist() == [-1, 1] and in_one_plane(device(**crossed, **CLEAR)).tolist() == [-1, -1]
-
-
-@pytest.mark.parametrize('aside, beyond', [([0.9, 0.5], [0.3, 0.0]), ([0.5, 0.1], [0.3, 0.0]), ([0.9, 0.1], [0.7, 0.0]), ([0.9, 0.1], [0.3, 0.4])],
-                         ids=['both are crossed', 'nothing crosses', 'the device goes on', 'it goes on in the other'])
-def test_where_no_plane_shows_an_end_alone(aside, beyond):
-    f = device(aside=np.array([[0.0, 0.0], aside]), beyond=np.array([[0.0, 0.0], beyond]))
-    assert seen_alone(f).tolist() == [-1, -1]
+def test_with_an_end_that_a_line_hides_in_one_plane_the_rest_must_be_certain():
+    alone = dict(aside=np.array([[0.0, 0.1], [0.9, 0.1]]), beyond=np.array([[0.0, 0.0], [0.3, -0.4]]), alone=np.array([-1, 1]))
+    assert doubt(device(**alone), MIN_LENGTH_PX) is None
+    assert 'a line hides' in doubt(device(**alone | dict(weakest=np.array([0.92, 0.98]))), MIN_LENGTH_PX)[1]
+    assert 'a line hides' in doubt(device(**alone | dict(likeness=np.array([0.97, 0.97]))), MIN_LENGTH_PX)[1]
+    assert 'fades' in doubt(device(**alone | dict(presence=faded(0.6))), MIN_LENGTH_PX)[1]
 
 
 def test_an_end_that_leaves_the_field_is_not_blunt():
