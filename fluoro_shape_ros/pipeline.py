@@ -28,6 +28,7 @@ REGION_PX = 80          # a tracked device moves and grows less than this from o
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 CALIBRATION_PX = 0.25   # what the best calibration of a plane is worth
+SOME = 12
 
 
 def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconstruction:
@@ -130,7 +131,7 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     points, tangents = basis @ f.spline.control, slope @ f.spline.control
     n = len(f.spline.control)
     half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
-    covariance = np.einsum('iamb,im->iab', half, basis) + calibration_covariance(views, points, tangents, CALIBRATION_PX)
+    covariance = (half.transpose(0, 1, 3, 2) @ basis[:, None, :, None])[..., 0] + _calibration(views, points, tangents)
     tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
     sigma = f.end_sigma if forward else f.end_sigma[::-1]
     covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
@@ -138,6 +139,14 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan) if k.any() else np.full(len(at), np.nan)
                           for o, k in zip(f.offset_px.T, known)], axis=1)
     return Shape(points, s, covariance, residuals)
+
+
+def _calibration(views, points: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) m^2 that a calibration's errors add to (N, 3) points of a curve; between SOME of them they change evenly."""
+    k = np.linspace(0, len(points) - 1, SOME).round().astype(int)
+    some = calibration_covariance(views, points[k], tangents[k], CALIBRATION_PX)
+    at = np.interp(np.arange(len(points)), k, np.arange(SOME))
+    return (np.maximum(1 - np.abs(at[:, None] - np.arange(SOME)), 0) @ some.reshape(SOME, 9)).reshape(-1, 3, 3)
 
 
 def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
