@@ -63,7 +63,7 @@ class End:
     @property
     def apart(self) -> float:
         """m by which the planes differ; 0 where only one shows the end."""
-        return abs(float(np.nan_to_num(self.seen_at[0] - self.seen_at[1])))
+        return float(np.fmax(abs(self.seen_at[0] - self.seen_at[1]), 0.0))
 
     def disagreed(self, px_per_m: float) -> bool:
         """Whether the planes differ by more than noise."""
@@ -92,7 +92,7 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     counted = near[:, None] & np.isfinite(y) & np.isfinite(sigma)[..., None]
     counted &= counted.sum(axis=2, keepdims=True) >= 12
     y = np.where(counted, y, 0.0)
-    weight = np.where(counted.any(axis=2), 1 / (density * np.maximum(np.nan_to_num(sigma, posinf=0.0), 0.02) ** 2), 0.0)        # (E, 2)
+    weight = np.where(counted.any(axis=2), 1 / (density * np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), 0.02) ** 2), 0.0)        # (E, 2)
 
     def edges(ends: np.ndarray, blur: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of edges at (E, C) `ends` with blurs (..., E, 2): (..., E, 2, C) cost and height, and (E, 2, C, n) px that each strip lies inside the device."""

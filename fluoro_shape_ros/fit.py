@@ -256,7 +256,7 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-               contrast, across, width, odd, alike, weakest, np.nan_to_num(found.beyond), np.where(open_end[:, None], 0.0, aside), np.full(2, -1)), ends
+               contrast, across, width, odd, alike, weakest, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside), np.full(2, -1)), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -307,7 +307,7 @@ def _contrast(profile: np.ndarray) -> float:
 def shown(f: Fit) -> np.ndarray:
     """(2,) share of the device's length that each plane shows."""
     between = (f.s > f.start) & (f.s < f.stop)
-    return (np.nan_to_num(f.presence[between]) > 0.4).mean(axis=0) if between.any() else np.zeros(2)
+    return (f.presence[between] > 0.4).mean(axis=0) if between.any() else np.zeros(2)
 
 
 def contrast_ratio(f: Fit) -> float:
@@ -319,4 +319,4 @@ def ends_shown(f: Fit) -> np.ndarray:
     """(2, 2) presence of the device in its last END_PX, first and last end (rows), plane A, B; 1 where it leaves the field."""
     px = END_PX * (f.s[1] - f.s[0])
     last = [f.presence[(f.s > low) & (f.s < high)] for low, high in ((f.start, f.start + px), (f.stop - px, f.stop))]
-    return np.stack([np.ones(2) if leaves or not len(p) else np.nan_to_num(p).clip(0, 1).mean(axis=0) for p, leaves in zip(last, f.open_end)])
+    return np.stack([np.ones(2) if leaves or not len(p) else np.minimum(np.fmax(p, 0), 1).mean(axis=0) for p, leaves in zip(last, f.open_end)])
