@@ -21,6 +21,8 @@ TURNED_ASIDE, TURNED_BEYOND = 0.9, -0.3     # both at once, in either plane
 MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane ...
 MIN_END_DARK = 0.71     # ... and in both on average, or in the one that alone shows the end: the edge of a bone beyond it is half as dark ...
 MIN_CROWDED_DARK = 0.8  # ... where both planes show something beside it
+PALE, BESIDE = 0.7, 0.3 # presence of the last stretch in one plane, and darkness of a line beside it there that may be the device ...
+CERTAIN_PALE = 0.7      # ... unless the evidence is as good as this
 MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
 BLUNT, BLUNT_PX = 0.35e-3, 1.2          # the same, from which on an end is not clear: then a line beside it by MAX_ASIDE in one plane may be the device's ...
 BARE = 0.05             # ... unless straight on it is at least so dark there
@@ -98,6 +100,8 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
             return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
         if end_dark[k] < (MIN_CROWDED_DARK if crowded(f)[k] else MIN_END_DARK):
             return Outcome.POORLY_EXPLAINED, f'it fades towards its {name} end: it follows the edge of something there'
+        if speaks < CERTAIN_PALE and ((each[k] < PALE) & (f.aside[k] > BESIDE)).any():
+            return Outcome.POORLY_EXPLAINED, f'in one plane it fades towards its {name} end, and there is a line beside it'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
     if speaks < MIN_EVIDENCE:

@@ -117,6 +117,8 @@ def test_a_clear_device_raises_no_doubt():
     (dict(presence=hidden(0.055, 0.07, 1)), Outcome.DIRECTIONS_DISAGREE, 'last end'),
     (dict(presence=faded(0.6)), Outcome.POORLY_EXPLAINED, 'fades towards its last end'),
     (dict(presence=faded(0.75), aside=np.array([[0.0, 0.0], [0.5, 0.45]])), Outcome.POORLY_EXPLAINED, 'fades towards its last end'),
+    (dict(presence=device().presence - 0.4 * (S > 0.052)[:, None] * [0, 1], aside=np.array([[0.0, 0.0], [0.0, 0.4]]), likeness=np.array([0.98, 0.98])),
+     Outcome.POORLY_EXPLAINED, 'in one plane it fades'),
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
 ])
 def test_each_doubt_of_a_fit_has_its_name(other, outcome, word):
