@@ -33,7 +33,7 @@ CLEAR = 2.0             # noise deviations: darker strips speak for the device, 
 MOVES = np.array([0, -1, 1])
 SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
-SHARP = 0.35e-3         # m: an end less certain than this may be another one
+SHARP = 0.5e-3          # m: an end less certain than this may be another one
 
 
 def found_near(sheet: Sheet, config: Config, guess: Guess) -> Detection | None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .curve import arc_length, resample
+from .curve import arc_length, at_arc_length, even_steps
 from .data import Prior, Reconstruction
 from .fit import Fit
 from .geometry import depth, project
@@ -27,6 +28,11 @@ class Guess:
 
     points: np.ndarray      # (N, 3) m, base to tip, in equal steps of about STEP
     sigma: np.ndarray       # (N,) m, standard deviation of each, growing along the length
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """What finds the nearest of the points."""
+        return cKDTree(self.points)
 
 
 def newest(predictions: Iterable, stamp_ns: int):
@@ -54,7 +60,8 @@ def look(prior: Prior, views, sigma_tip: float) -> tuple[Guess | None, str]:
     length = arc_length(points)[-1]
     if not SHORTEST < length < LONGEST:
         return None, f'its length is {1000 * length:.4g} mm'
-    even, s = resample(points, STEP)
+    s = even_steps(length, STEP)
+    even = at_arc_length(points, s)
     for view in views:
         if depth(view.P, even).min() <= 0 or not in_image(view, project(view.P, even)).any():
             return None, f'it lies outside plane {view.name}\'s image'
@@ -81,7 +88,7 @@ def doubt(points: np.ndarray, g: Guess) -> str:
 
     Every point must lie near the predicted curve, and the tip near its tip, by the guess's own standard deviations.
     """
-    distance, k = cKDTree(g.points).query(points)
+    distance, k = g.tree.query(points)
     if k[-1] < k[0]:
         return 'base and tip are the other way round'
     distance = np.append(distance, np.linalg.norm(points[-1] - g.points[-1]))
@@ -100,7 +107,7 @@ def informed(f: Fit, g: Guess) -> Fit:
     s = np.linspace(f.start, f.stop, INDEPENDENT)
     points, tangents = f.spline.lines(s)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    _, k = cKDTree(g.points).query(points)
+    _, k = g.tree.query(points)
     across = np.eye(3) - tangents[:, :, None] * tangents[:, None, :]
     basis, = f.spline.bases(s, 0)
     H = (across[:, :, None, :] * basis[:, None, :, None]).reshape(3 * len(s), -1)          # (3 INDEPENDENT, 3 n)
