@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import threading
 import time
 
 import numpy as np
@@ -51,13 +52,13 @@ class Robot(OwnNode):
         self._node.create_subscription(MarkerArray, 'markers', self._on_markers, 10)     # they come for every pair, rejected or not
         self._node.create_service(Trigger, 'blackout', self._on_blackout)
 
-    def run(self, xray: FluoroSim) -> None:
-        """Publish joints, prediction and a pair again and again; ends with a signal."""
+    def run(self, xray: FluoroSim, stop: threading.Event) -> None:
+        """Publish joints, prediction and a pair again and again until `stop` is set."""
         due = time.monotonic()
-        while True:
+        while not stop.is_set():
             self._publish(xray)
             due = max(due + self._period, time.monotonic() - self._period)
-            self._serve(due)
+            self._serve(due, stop)
             self._joints = driven(plant.ROBOTS[self._name].robot.joints, self._joints, self._command, self._period)
             self._index += 1
             self._stamps = [*self._stamps[-2:], self._stamps[-1] + round(self._period * 1e9)]
@@ -74,10 +75,10 @@ class Robot(OwnNode):
         scene = self._plant.scene(self._joints, self._index, now)
         return plant.without_device(self._plant, self._index, scene, BLIND) if self._dark[0] <= now < self._dark[1] else scene
 
-    def _serve(self, due: float) -> None:
+    def _serve(self, due: float, stop: threading.Event) -> None:
         """Take commands until the next pair is due and the one before the last answered, the latter for at most PATIENCE_S."""
         late = time.monotonic() + PATIENCE_S
-        while (now := time.monotonic()) < due or (self._answered < self._stamps[-2:][0] and now < late):
+        while not stop.is_set() and ((now := time.monotonic()) < due or (self._answered < self._stamps[-2:][0] and now < late)):
             self._executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.01)) or 0.005)
 
     def _on_command(self, msg: JointState) -> None:
@@ -101,18 +102,22 @@ def main(argv=None) -> int:
     own.add_argument('--no-anatomy', action='store_true')
     for name, kind in (('--seed', int), ('--rate', float), ('--size', int)):
         own.add_argument(name, type=kind, required=True)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    code = cli.run(_run, own, argv)
-    return 0 if code == 130 else code
+    return cli.run(_run, own, argv)
 
 
 def _run(args) -> int:
     use_large_image_profile()
     what = plant.plant(args.robot, args.seed, args.size, not args.no_anatomy)
+    stop = threading.Event()
     with FluoroSim() as xray, Robot(args.robot, args.rate, what) as robot:
-        if not xray.wait_for_subscribers(CONNECT_S):
+        def end(*_) -> None:
+            stop.set()
+            xray.stop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, end)      # no exception: one within rclpy's conversions would come out as another
+        if not xray.wait_for_subscribers(CONNECT_S) and not stop.is_set():
             raise cli.ToolError(f'nobody listens to the images after {CONNECT_S:g} s')
-        robot.run(xray)
+        robot.run(xray, stop)
     return 0
 
 
