@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from .centerline import find_ridges, ridge_scale, shrinking
 from .chains import Candidate, find_candidates
 from .data import Outcome
-from .fit import COARSE, Fit, fit
+from .fit import COARSE, EXTENSION_PX, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .matching import align
 from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence
@@ -177,9 +177,9 @@ def _projected(f: Fit, view) -> np.ndarray:
     return distort(view, project(view.P, f.spline(np.linspace(f.start, f.stop, 100))))
 
 
-def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, **how) -> Detection | None:
+def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, beyond_px: float = EXTENSION_PX) -> Detection | None:
     """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
-    fitted = fit(sheet, points, radius, **dict(coarse=1) | how)
+    fitted = fit(sheet, points, radius, 1, beyond_px)
     if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or (fitted.alone >= 0).any():
         return None
     if evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):

@@ -31,6 +31,7 @@ TRUST = 0.1             # ... and what the prediction counts in each strip: its 
 SMOOTH = 2.0            # strips, over which the path is smoothed
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
 MOVES = np.array([0, -1, 1])
+LOOKED_PX = 48.0        # past both ends of the path, which often stops short of the device's
 SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
@@ -44,7 +45,7 @@ def found_near(sheet: Sheet, config: Config, guess: Guess) -> Detection | None:
     start = follow(sheet, guess, config.detection.robot_radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = track(sheet, config.detection.robot_radius, config.detection.min_length_px, start, coarse=1, beyond_px=48.0)
+    found = track(sheet, config.detection.robot_radius, config.detection.min_length_px, start, LOOKED_PX)
     if found is None:
         return None
     f = found.fit

@@ -28,7 +28,8 @@ REGION_PX = 80          # a tracked device moves and grows less than this from o
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 CALIBRATION_PX = 0.25   # what the best calibration of a plane is worth
-SOME = 12
+SOME = 12               # points of a backbone at which that is worked out
+WHOLE = slice(None), slice(None)    # rows and columns of an image
 
 
 def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconstruction:
@@ -171,9 +172,6 @@ def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice], 
         np.sqrt(dark_device(image[region], polarity), out=out)
     else:       # needs the whole image's statistics
         np.sqrt(dark_device(image, polarity)[region], out=out)
-
-
-WHOLE = slice(None), slice(None)
 
 
 def _sheet(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Sheet:
