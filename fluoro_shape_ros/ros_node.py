@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 import traceback
 from collections import deque
@@ -277,6 +278,7 @@ class FluoroShapeNode(Node):
             self._report(statuses)
 
     def _on_second(self) -> None:
+        gc.collect()    # cheap after node.main's freeze; Python keeps thousands of freed tuples for later, and only this gives them back
         self._inputs.count()
         self._hand_over()
         self._report(self._statuses())

@@ -172,7 +172,7 @@ class Client:
         """Whether `condition()` came true before the deadline."""
         deadline = time.monotonic() + limit
         while not condition() and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.05)
+            self._executor.spin_once(timeout_sec=min(0.05, max(deadline - time.monotonic(), 0.0)))
         return bool(condition())
 
     def connected(self):
