@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -13,6 +14,7 @@ from .chains import Candidate, find_candidates
 from .data import Outcome
 from .fit import COARSE, EXTENSION_PX, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
+from .hop import other_lines
 from .matching import align
 from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence
 from .start import first_curve
@@ -30,6 +32,7 @@ SEEN = 0.6              # ... which must show this share of the line
 FLIPPED = 0.7           # alignment of a pair of lines read the other way round, as a share of the better way's, that must be looked at, too ...
 RIVAL, APART = 0.7, 5e-3        # ... and the weight of a curve that far from the chosen one, m, as a share of its weight, that makes it a rival ...
 SHARPER = 3.5           # ... unless the ends of one are clearer by this, as the planes agree on them
+BESIDE = 2e-3           # m: as far from a curve for which more speaks, but for clear ends, one found by taking lines away is not believed
 EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it ...
@@ -93,11 +96,11 @@ def detect(sheet: Sheet, radius: float, min_length_px: float) -> Detection:
         if not found:
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
 
-    def attempts(starts, times: int) -> Iterator[Attempt]:
+    def attempts(starts, times: int, clearing: bool = False) -> Iterator[Attempt]:
         """Fits, each as often again from where it came to lie: a start some px off may catch on another line where the next does not."""
         for points, lines, coarse in starts:
             for _ in range(times):
-                fitted = fit(sheet, points, radius, coarse)
+                fitted = fit(sheet, points, radius, coarse, clearing=clearing)
                 if fitted is None:
                     break
                 share = min(explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None)
@@ -115,14 +118,8 @@ def detect(sheet: Sheet, radius: float, min_length_px: float) -> Detection:
     if not tried:
         return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
     chosen = max(tried, key=lambda t: t.weight)
-    if not chosen.believed:       # who tries often must ask for more: clear ends too
-        more = []
-        for attempt in attempts(_again(sheet, candidates, widths, tried), 2):
-            more.append(attempt)
-            if attempt.believed and not blunt(attempt.fit).any():
-                break
-        good = [t for t in more if t.convincing and not t.doubt and not blunt(t.fit).any()]
-        chosen = max(good, key=lambda t: (t.believed, t.weight), default=chosen)
+    if not chosen.believed:
+        chosen = _second_look(partial(attempts, times=2, clearing=True), sheet, radius, candidates, widths, tried) or chosen
     others = [t for t in tried if t.plain > RIVAL * chosen.plain and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
     if others:      # lines along epipolar lines: only the ends tell which way round they belong together
         chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
@@ -146,11 +143,28 @@ def _pairs(views, candidates) -> Iterator[Start]:
         yield first_curve(views, curves[0][a], curves[1][b], alignment), (candidates[0][a], candidates[1][b]), 0
 
 
-def _again(sheet: Sheet, candidates, widths, tried: list[Attempt]) -> Iterator[Start]:
-    """Where else it may be, when no pair of lines settled it: where the likeliest fits came to lie; where the other plane shows what one plane's line
-    alone says; and the likeliest again with a search around their starts."""
-    likeliest = sorted((t for t in tried if t.promising), key=lambda t: -t.weight)[:AGAIN]
+def _second_look(attempts, sheet: Sheet, radius: float, candidates, widths, tried: list[Attempt]) -> Attempt | None:
+    """What `attempts` that take lines beside the device away find, starting anew; who tries so often must ask for more: clear ends, and nothing better beside."""
+    more = []
+    for attempt in attempts(_again(sheet, radius, candidates, widths, tried)):
+        more.append(attempt)
+        if attempt.believed and not blunt(attempt.fit).any():
+            more += attempts(_beside(attempt, sheet, radius))       # the line taken away may be the device
+            break
+    better = lambda t: (r for r in (*tried, *more) if r.convincing and r.plain > t.plain)      # noqa: E731
+    good = [t for t in more if t.convincing and not t.doubt and not blunt(t.fit).any() and all(_apart(t.fit, r.fit) < BESIDE for r in better(t))]
+    return max(good, key=lambda t: (t.believed, t.weight), default=None)
+
+
+def _again(sheet: Sheet, radius: float, candidates, widths, tried: list[Attempt]) -> Iterator[Start]:
+    """Where else it may be, when no pair of lines settled it: where the likeliest fits came to lie, where all of them started, and beside the likeliest;
+    where the other plane shows what one plane's line alone says; and the likeliest again with a search around their starts."""
+    by_weight = sorted(tried, key=lambda t: -t.weight)
+    likeliest = [t for t in by_weight if t.promising][:AGAIN]
     yield from ((_curve(attempt.fit), attempt.lines, 0) for attempt in likeliest)
+    yield from ((attempt.start, attempt.lines, 0) for attempt in by_weight)
+    for attempt in likeliest:
+        yield from _beside(attempt, sheet, radius)
     views, dark = sheet.views, [darkness(*plane) for plane in zip(sheet.planes, sheet.fields, widths)]
     paths = []
     for k, (view, found) in enumerate(zip(views, candidates)):
@@ -160,6 +174,11 @@ def _again(sheet: Sheet, candidates, widths, tried: list[Attempt]) -> Iterator[S
                 paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (c, None)[::1 - 2 * k]))
     yield from ((points, lines, 0) for _, points, lines in sorted(paths, key=lambda p: -p[0]))
     yield from ((attempt.start, attempt.lines, COARSE) for attempt in likeliest)
+
+
+def _beside(attempt: Attempt, sheet: Sheet, radius: float) -> Iterator[Start]:
+    """The same lines, but for the line beside them."""
+    yield from ((points, attempt.lines, 0) for points in other_lines(sheet, attempt.fit, radius))
 
 
 def _curve(f: Fit) -> np.ndarray:

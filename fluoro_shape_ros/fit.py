@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 
+from .beside import without_neighbours
 from .curve import arc_length, middle
 from .extent import BLURS_PX, End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
@@ -66,17 +67,18 @@ class Fit:
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
 
 
-def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE, beyond_px: float = EXTENSION_PX) -> Fit | None:
+def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE, beyond_px: float = EXTENSION_PX, clearing: bool = False) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
     radius: of the device, m. coarse: rounds that search for it a few px around. beyond_px: how far past both ends is looked at once.
+    clearing: take the line beside the device away, if there is one; slower.
     """
     views = sheet.views
     scale = [pixels_per_metre(v.P, points) for v in views]
     half_width, step = [radius * k for k in scale], 1 / max(scale)
     if max(half_width) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in views) <= 0:
         return None     # it goes to a source
-    pair = _Pair.of(sheet, half_width, step)
+    pair = _Pair.of(sheet, half_width, step, clearing)
     seen = pair.settle(through(points, beyond_px * step), (0.0, arc_length(points)[-1]), coarse, FINE)
     if seen is None:
         return None
@@ -125,24 +127,25 @@ class _Pair:
     template: np.ndarray    # (2, W) a cylinder's shadow
     cylinder: Model
     beside: list            # see profiles.background
+    cleared: list | None    # px, the device's half width in each plane where the line beside it is taken away
 
     @classmethod
-    def of(cls, sheet: Sheet, half_width, step: float) -> _Pair:
+    def of(cls, sheet: Sheet, half_width, step: float, clearing: bool) -> _Pair:
         reach = half_width_range(max(half_width))
         offsets = np.arange(-reach, reach + 1)
         template = _shadows(half_width, offsets)
-        return cls(sheet, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template])
+        return cls(sheet, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template], half_width if clearing else None)
 
     def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int, fine: int, near: bool = False) -> _Seen | None:
         """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is none."""
         views = self.sheet.views
         if not spline.stop - spline.start < self.step * min(LONGEST_PX, sum(v.width + v.height for v in views)):
             return None     # it has left the images, or turns back and forth in them
-        cut_here = lambda layout, wider=0.0: cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + wider, wider > 0)     # noqa: E731
+        cut_here = lambda layout: self.cut(layout.basis @ spline.control, layout.slope @ spline.control)     # noqa: E731
         layout = Layout.of(spline, COARSE_STEP * self.step)
         within = (layout.s >= reference[0]) & (layout.s <= reference[1])
         for _ in range(coarse):
-            strips = cut_here(layout, WIDE_PX)
+            strips = cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + WIDE_PX, rough=True)
             spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within, near=near).spline
         if not coarse:
             strips = cut_here(layout)
@@ -170,7 +173,7 @@ class _Pair:
 
     def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
         """The curve prolonged as long as that finds more of the device, straight on or beside it; and (2, 2) what then is aside, see `aside`."""
-        by = GROWTH_PX * self.step
+        by, coarse = GROWTH_PX * self.step, int(self.cleared is None)     # a search would find the line beside the device again
         for _ in range(GROWTH):
             beyond, aside = seen.beyond, None
             known = ~np.isnan(beyond).any(axis=1)
@@ -181,7 +184,7 @@ class _Pair:
                 if not goes_on.any():
                     return seen, aside
             (start, stop), (spline, shift) = seen.reference, prolong(seen.solution.spline, goes_on, by)
-            longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), 1, FINE - 1, near=True)
+            longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), coarse, FINE - 1, near=True)
             more = longer is not None and np.diff(longer.reference) - (stop - start) > NEAR_END_PX * self.step
             if not more and aside is not None:
                 return seen, aside      # that line is another one
@@ -198,9 +201,15 @@ class _Pair:
         line = search(strips, self.template.repeat(2, axis=0))
         return middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
 
+    def cut(self, points: np.ndarray, tangents: np.ndarray) -> Strips:
+        """Strips across the projections of (N, 3) points with (N, 3) tangents."""
+        if self.cleared is None:
+            return cut(self.sheet, points, tangents, self.reach)
+        return without_neighbours(cut(self.sheet, points, tangents, self.reach + WIDE_PX), self.cleared, self.reach)
+
     def look(self, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
         """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
-        strips = cut(self.sheet, *f.spline.lines(s.ravel()), self.reach)
+        strips = self.cut(*f.spline.lines(s.ravel()))
         if s.ndim == 2:
             strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
         return strips, measure(strips, model, within)

@@ -15,6 +15,7 @@ from .curve import arc_length, middle
 from .detect import Detection, track
 from .fit import Fit
 from .geometry import pixels_per_metre
+from .hop import darkest_path
 from .prior import Guess, borne_out, in_image, whole
 from .solver import Layout, solve
 from .spline import through
@@ -30,7 +31,6 @@ BEND_COST = 0.7         # of a shift that changes from a strip to the next ...
 TRUST = 0.1             # ... and what the prediction counts in each strip: its error is the same in many
 SMOOTH = 2.0            # strips, over which the path is smoothed
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
-MOVES = np.array([0, -1, 1])
 LOOKED_PX = 48.0        # past both ends of the path, which often stops short of the device's
 SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
@@ -78,7 +78,7 @@ def follow(sheet: Sheet, guess: Guess, radius: float) -> np.ndarray | None:
     strength = _response(sheet, sheet.places(centers, normals, shifts), radius * scale)[..., ::SHIFT_PX]
     shifts = shifts[::SHIFT_PX]
     away = shifts / sigma_px[..., None]
-    best = _most_probable(np.where(np.abs(away) > WITHIN, -np.inf, strength - TRUST * away**2 / 2))
+    best = darkest_path(np.where(np.abs(away) > WITHIN, -np.inf, strength - TRUST * away**2 / 2), BEND_COST)
     gain = np.take_along_axis(strength, best[..., None], axis=2)[..., 0] - CLEAR
     seen = np.zeros(gain.shape, bool)
     for g, s, c, v in zip(gain, seen, centers, views):
@@ -115,19 +115,3 @@ def _darkest_stretch(gain: np.ndarray) -> tuple[int, int]:
     lowest = np.minimum.accumulate(total)
     stop = int((total - lowest).argmax())
     return int(total[:stop + 1].argmin()), stop
-
-
-def _most_probable(score: np.ndarray) -> np.ndarray:
-    """(V, N) column a row of the (V, N, W) scores: the path of the highest sum that moves by at most a column a row, each move at BEND_COST."""
-    total = np.full((score.shape[1], len(score), score.shape[2] + 2), -np.inf)      # of paths that end there, with a margin
-    total[..., 1:-1] = score.transpose(1, 0, 2)
-    for before, here in zip(total[:-1], total[1:]):
-        came = np.maximum(before[:, :-2], before[:, 2:]) - BEND_COST
-        here[:, 1:-1] += np.maximum(came, before[:, 1:-1], out=came)
-    plane, column = np.arange(len(score)), total[-1].argmax(axis=1)
-    columns = [column]
-    for before in total[-2::-1]:
-        reach = before[plane[:, None], column[:, None] + MOVES] - BEND_COST * np.abs(MOVES)
-        column = column + MOVES[reach.argmax(axis=1)]
-        columns.append(column)
-    return np.stack(columns[::-1], axis=1) - 1

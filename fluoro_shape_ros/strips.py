@@ -215,6 +215,11 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     return Measurement(offset, variance, darkness / usual, sigma)
 
 
+def darkness_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
+    """(N, W) how dark a line with this (w,) shadow is at each place of (N, W) float32 profiles: a matched filter."""
+    return -cv2.filter2D(profiles, cv2.CV_32F, (shadow - shadow.mean())[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
+
+
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     """Where the darkest line that fits its plane's profile, a row of `shadows` (V, w), narrower than the strips, lies in each, averaged over `smooth` strips.
 
@@ -222,9 +227,7 @@ def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     """
     half = (shadows.shape[1] - 1) // 2
     inner = slice(half // 2, -(half // 2) or None)
-    kernels = (shadows - shadows.mean(axis=1, keepdims=True)).astype(np.float32)
-    response = np.stack([cv2.blur(-cv2.filter2D(p, cv2.CV_32F, k[None], borderType=cv2.BORDER_REPLICATE), (1, smooth))[:, inner]
-                         for p, k in zip(strips.profiles, kernels)])
+    response = np.stack([cv2.blur(darkness_across(p, t), (1, smooth))[:, inner] for p, t in zip(strips.profiles, shadows)])
     best = np.argmax(response, axis=2)
     at = np.clip(best, 1, response.shape[2] - 2)[..., None] + np.array([-1, 0, 1])
     before, darkest, after = np.moveaxis(np.take_along_axis(response, at, axis=2), 2, 0)
