@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -79,10 +79,10 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     """Where the device ends, for E ends at once.
 
     s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,) +1 for an end at large s, -1 at
-    small. beyond: (E, 2) m, see `bulge`. ramp: (E,) m over which the end fades in the more foreshortened plane; its model is worth RAMP of that.
+    small. beyond: (E, 2) m, see `bulge`. ramp: (E, 2) m over which the end fades in each plane; the model is worth RAMP of that.
     density: strips a px, so many of which are one observation. reach_px: how far from the guess it is looked for.
     Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
-    clipped at 3.5 sigma.
+    clipped at 3.5 sigma. Where the planes differ by more than a standard deviation, but do not disagree, each counts by what its edge is worth.
     """
     e = np.arange(len(s))
     px_per_m = speed[e, :, np.abs(s - guess[:, None]).argmin(axis=1)].mean(axis=1)
@@ -108,13 +108,16 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
         return (slope * slope).sum(axis=2) * weight
 
     both = e[:, None], np.arange(2)
-    model = (FLOOR_PX / px_per_m) ** 2 + (0.2 * beyond.mean(axis=1)) ** 2 + (RAMP * ramp) ** 2
+    floor = (FLOOR_PX / px_per_m) ** 2
+    model = floor + (0.2 * beyond.mean(axis=1)) ** 2 + (RAMP * ramp.max(axis=1)) ** 2
     wide = guess[:, None] + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m[:, None]
     cost, a, z = edges(wide, np.broadcast_to(np.reshape(blurs_px, (-1, 1, 1)), (len(blurs_px), len(s), 2)))
     best = cost.min(axis=3).argmin(axis=0)
     cost, a, blur = cost[best, *both], a[best, *both], np.array(blurs_px)[best]
     lowest = cost.argmin(axis=2)
-    seen_sigma = np.sqrt(1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12) + model[:, None])
+    noise = 1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12)
+    seen_sigma = np.sqrt(noise + model[:, None])
+    trust = 1 / (noise + floor[:, None] + (0.2 * beyond) ** 2 + (RAMP * ramp) ** 2)      # (E, 2), the more foreshortened a plane sees the end, the less
     fine = wide[e, cost.sum(axis=1).argmin(axis=1)][:, None] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None]
     fine_cost, a, z = edges(fine, blur)
     fine_cost = fine_cost.sum(axis=1)
@@ -125,7 +128,10 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
         seen = weight[i] > 0
         if seen.any():
             seen_at = np.array([_lowest(wide[i], c) for c in cost[i]])
-            ends.append(End(_lowest(fine[i], fine_cost[i]), float(sigma[i]), np.where(seen, seen_at, np.nan), np.where(seen, seen_sigma[i], np.nan)))
+            end = End(_lowest(fine[i], fine_cost[i]), float(sigma[i]), np.where(seen, seen_at, np.nan), np.where(seen, seen_sigma[i], np.nan))
+            if end.apart > np.hypot(*trust[i] ** -0.5) and not end.disagreed(px_per_m[i]):
+                end = replace(end, at=float(trust[i] @ seen_at / trust[i].sum()))      # of two edges the joint one is the sharper, not the better known
+            ends.append(end)
         else:
             ends.append(End(float(guess[i]), float('inf'), np.full(2, np.nan), np.full(2, np.nan)))
     return ends

@@ -269,9 +269,9 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2, 2) m of `bulge` at each end (rows) in each plane, and (2,) m over which each end fades in the more foreshortened plane."""
+    """(2, 2) m of `bulge` at each end (rows) in each plane, and (2, 2) m over which each end fades there."""
     sine = np.clip(speed / px_per_m, 0.1, 1.0)
-    return bulge(radius, speed, px_per_m, across), radius * (np.sqrt(1 - sine**2) / sine).max(axis=1)
+    return bulge(radius, speed, px_per_m, across), radius * np.sqrt(1 - sine**2) / sine
 
 
 def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -> Fit:

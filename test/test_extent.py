@@ -67,7 +67,7 @@ def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):
 
 def placed(s, presence, sigma, speed, guess, outward, beyond):
     """m: where the device ends, and its standard deviation."""
-    end, = locate(s[None], presence.T[None], sigma[None], speed.T[None], np.array([guess]), np.array([outward]), beyond[None], np.zeros(1))
+    end, = locate(s[None], presence.T[None], sigma[None], speed.T[None], np.array([guess]), np.array([outward]), beyond[None], np.zeros((1, 2)))
     return end.at, end.honest_sigma(SPEED.mean())
 
 
@@ -100,6 +100,19 @@ def test_sigma_is_the_scatter_over_noise(noise):
     assert 0.5 < np.mean(np.square(z)) < 1.4
     assert abs(np.mean(z)) < 0.35
     assert np.mean(np.abs(z) < 1.96) > 0.88
+
+
+def test_where_the_planes_differ_the_less_foreshortened_one_counts_more():
+    end = 100.4 * PX
+    p = edge([end, end - 0.8 * PX])
+
+    def at(ramp_px):
+        found, = locate(S[None], p.T[None], np.full((1, 2), 0.02), SPEED.T[None], np.array([end]), np.array([1]), NONE[None], np.array([ramp_px]) * PX)
+        return found.at
+
+    assert abs(at([0.0, 5.0]) - end) < 0.15 * PX                # the model of plane B's end is worth half a px
+    assert abs(at([5.0, 0.0]) - end + 0.8 * PX) < 0.15 * PX
+    assert abs(at([0.0, 0.0]) - end + 0.4 * PX) < 0.15 * PX
 
 
 def test_one_plane_will_do_and_knows_less():
