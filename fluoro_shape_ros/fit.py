@@ -17,7 +17,8 @@ from .extent import BLURS_PX, End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .profiles import WIDTHS, apparent_width, background, best_of_worst, likeness, mean_profile, odd_width, own_shadow, pieces, shadow
+from .profiles import (WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces, shadow,
+                       straight_on)
 from .strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
@@ -64,7 +65,12 @@ class Fit:
     weakest: np.ndarray         # (2,) the same where it looks least like one, see profiles.best_of_worst
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
+    fading: np.ndarray          # (2,) logarithm of how dark both planes show its last stretch at each end, beside the rest of it, see profiles.fading
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
+
+    def curve(self, count: int) -> np.ndarray:
+        """(count, 3) m along the device."""
+        return self.spline(np.linspace(self.start, self.stop, count))
 
 
 def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE, beyond_px: float = EXTENSION_PX, clearing: bool = False) -> Fit | None:
@@ -246,10 +252,11 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
     between = (s > reference[0]) & (s < reference[1])
     profile = [mean_profile(p, between & i) for p, i in zip(strips.profiles, strips.inside)]
-    contrast = np.array([_contrast(p) for p in profile])
+    contrast = contrast_of(np.stack(profile))
     scale = np.array(half_width) / radius
-    across = 1 - (1 - contrast) ** np.clip(middle(strips.speed[:, between]) / scale, 0.2, 1)     # Beer-Lambert: seen straight on
-    each = [likeness(pieces(p, between & i)[0], h) for p, i, h in zip(strips.profiles, strips.inside, half_width)]
+    across = straight_on(contrast, middle(strips.speed[:, between]) / scale)
+    parts = [pieces(np.column_stack([p, v]), between & i)[0] for p, v, i in zip(strips.profiles, strips.speed, strips.inside)]
+    each = [likeness(p[:, :-1], h) for p, h in zip(parts, half_width)]
     width, alike = apparent_width(each)
     weakest = np.array([best_of_worst(a[:, WIDTHS == width].ravel()) for a in each])
     opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line
@@ -265,7 +272,8 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-               contrast, across, width, odd, alike, weakest, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside), np.full(2, -1)), ends
+               contrast, across, width, odd, alike, weakest, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
+               np.where(open_end, 0.0, sum(fading(p[:, :-1], p[:, -1] / k) for p, k in zip(parts, scale))), np.full(2, -1)), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -306,11 +314,6 @@ def _shown_by_one(f: Fit) -> np.ndarray:
 def crowded(f: Fit) -> np.ndarray:
     """(2,) bool: whether both planes show something beside where the first and the last end would go on."""
     return f.aside.min(axis=1) > CROWDED
-
-
-def _contrast(profile: np.ndarray) -> float:
-    """Share of the counts that the device takes at its middle; profiles are square roots of counts."""
-    return 1 - (profile[len(profile) // 2] / max(float(np.mean(profile[[0, 1, -2, -1]])), 1e-9)) ** 2
 
 
 def shown(f: Fit) -> np.ndarray:

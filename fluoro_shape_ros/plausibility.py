@@ -21,6 +21,7 @@ TURNED_ASIDE, TURNED_BEYOND = 0.9, -0.3     # both at once, in either plane
 MIN_END_SHOWN = 0.5     # presence of the device's last stretch in either plane ...
 MIN_END_DARK = 0.71     # ... and in both on average, or in the one that alone shows the end: the edge of a bone beyond it is half as dark ...
 MIN_CROWDED_DARK = 0.8  # ... where both planes show something beside it
+MAX_FADING = -0.34      # natural logarithm of how dark both planes show its last pieces, beside the others, unless its ends are clear
 PALE, BESIDE = 0.7, 0.3 # presence of the last stretch in one plane, and darkness of a line beside it there that may be the device ...
 CERTAIN_PALE = 0.7      # ... unless the evidence is as good as this
 MAX_END_SIGMA, MAX_END_PX = 1.2e-3, 4.0     # m, or px where those are larger: standard deviation of an end along the device
@@ -30,6 +31,7 @@ CLEAR, CLEAR_PX = 0.12e-3, 0.4          # the same, up to which an end is clear:
 CLEAR_BEYOND = 0.4      # ... and darkness past it ...
 CLEARER = 2.0           # ... so that this many times as much speaks for a fit with two such ends, and its profile may be less round:
 CLEAR_LIKENESS, CLEAR_WEAKEST = 0.93, 0.85
+EXPECTED = 1.4          # times as much speaks for a fit where a prediction has the device
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see `evidence`, for a length of 1 m
 CERTAIN, CERTAIN_WEAKEST = 0.6, 0.95    # the same, and the least likeness in a row, of a fit with an end that only one plane shows
@@ -39,14 +41,18 @@ ODD_WIDTH = 0.2         # an odd width by this makes a line exp(1/2) times less 
 NO_TIP = 0.2            # what is left of a line that leaves the field at both ends: it has no tip to show
 
 
-def evidence(f: Fit) -> float:
-    """How much speaks for a fit: a device looks like a cylinder of about its radius, is seen all along and equally dark by both planes, and stops in both at once."""
+def evidence(f: Fit, expected: bool = False) -> float:
+    """How much speaks for a fit: a device looks like a cylinder of about its radius, is seen all along and equally dark by both planes, and stops in both at once.
+
+    expected: a prediction has it there.
+    """
     if f.contrast.min() <= 0:
         return 0.0
     alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness) * (CLEARER if clear(f) else 1.0))
+    favour = (CLEARER ** (0.5 * np.count_nonzero(~f.open_end)) if clear(f, expected) else 1.0) * (EXPECTED if expected else 1.0)
+    return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness) * favour)
 
 
 def alike_device(odd: float, likeness: np.ndarray) -> float:
@@ -59,18 +65,24 @@ def blunt(f: Fit) -> np.ndarray:
     return ~f.open_end & (f.end_sigma > max(BLUNT, BLUNT_PX * (f.s[1] - f.s[0])))
 
 
-def clear(f: Fit) -> bool:
-    """Whether both planes show, and agree on, where the device begins and where it ends."""
-    return not f.open_end.any() and f.end_sigma.max() < max(CLEAR, CLEAR_PX * (f.s[1] - f.s[0])) and f.beyond.max() < CLEAR_BEYOND
+def clear(f: Fit, expected: bool = False) -> bool:
+    """Whether both planes show, and agree on, where the device begins and where it ends.
+
+    expected: a prediction has it there, then it may leave the field at one end if neither plane shows the other one pale.
+    """
+    seen = ~f.open_end
+    if not (seen.all() or expected and seen.any() and ends_shown(f)[seen].min() > PALE):
+        return False
+    return bool(f.end_sigma[seen].max() < max(CLEAR, CLEAR_PX * (f.s[1] - f.s[0])) and f.beyond[seen].max() < CLEAR_BEYOND)
 
 
-def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
-    """Whether what both planes show along a fitted curve is one device of at least `min_length_px`: None, or the rejection."""
+def doubt(f: Fit, min_length_px: float, expected: bool = False) -> tuple[Outcome, str] | None:
+    """Whether what both planes show along a fitted curve is one device of at least `min_length_px`: None, or the rejection. expected: a prediction has it there."""
     px = f.s[1] - f.s[0]    # m
     length_px = (f.stop - f.start) / px
     if length_px < min_length_px:
         return Outcome.NO_CORRESPONDENCE, f'only {length_px:.0f} px are seen by both planes'
-    certain = clear(f)
+    certain = clear(f, expected)
     if f.contrast.min() < MIN_CONTRAST or f.likeness.min() < (CLEAR_LIKENESS if certain else MIN_LIKENESS):
         return Outcome.POORLY_EXPLAINED, 'its profile is not that of a round device (likeness {:.2f}, {:.2f})'.format(*f.likeness)
     if f.weakest.min() < (CLEAR_WEAKEST if certain else MIN_WEAKEST):
@@ -83,7 +95,7 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
-    speaks, each, by = evidence(f) / np.sqrt(f.stop - f.start), ends_shown(f), f.alone
+    speaks, each, by = evidence(f) / np.sqrt(f.stop - f.start), ends_shown(f), f.alone        # of where it ends a prediction tells nothing
     alone = by >= 0
     if alone.any() and (speaks < CERTAIN or f.weakest.min() < CERTAIN_WEAKEST):
         return Outcome.POORLY_EXPLAINED, 'a line hides one of its ends in one plane, and too little else speaks for it'
@@ -98,13 +110,13 @@ def doubt(f: Fit, min_length_px: float) -> tuple[Outcome, str] | None:
             return Outcome.POORLY_EXPLAINED, f'its {name} end is not clear, and a line beside it goes on'
         if each[k].min() < MIN_END_SHOWN:
             return Outcome.DIRECTIONS_DISAGREE, f'only one plane shows its {name} end'
-        if end_dark[k] < (MIN_CROWDED_DARK if crowded(f)[k] else MIN_END_DARK):
+        if end_dark[k] < (MIN_CROWDED_DARK if crowded(f)[k] else MIN_END_DARK) or (f.fading[k] < MAX_FADING and not clear(f)):
             return Outcome.POORLY_EXPLAINED, f'it fades towards its {name} end: it follows the edge of something there'
         if speaks < CERTAIN_PALE and ((each[k] < PALE) & (f.aside[k] > BESIDE)).any():
             return Outcome.POORLY_EXPLAINED, f'in one plane it fades towards its {name} end, and there is a line beside it'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
-    if speaks < MIN_EVIDENCE:
+    if evidence(f, expected) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
         return Outcome.POORLY_EXPLAINED, 'too little speaks for it being one device in both planes (likeness, darkness, ends)'
     return None
 

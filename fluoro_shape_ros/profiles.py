@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from .curve import middle
 
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips
 STRETCH = 3             # pieces: longer than what hides a device
+LAST = 2                # pieces at an end that must be about as dark as the others
 OUTER = 0.02            # of a shadow: what is fainter lies beside the device
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
 WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
@@ -52,7 +52,7 @@ def best_of_worst(alike: np.ndarray) -> float:
     """Of (B,) likenesses of successive pieces the best of the STRETCH worst ones in a row: low only where a line looks like nothing round for long."""
     if len(alike) < STRETCH:
         return float(alike.max(initial=0.0))
-    return float(sliding_window_view(alike, STRETCH).max(axis=1).min())
+    return float(np.max([alike[k:len(alike) - STRETCH + 1 + k] for k in range(STRETCH)], axis=0).min())
 
 
 def odd_width(width: float, half_width_px: float) -> float:
@@ -99,6 +99,27 @@ def _shadow(half_width_cpx: int) -> tuple[np.ndarray, np.ndarray]:
     kernel = np.exp(-0.5 * (np.arange(-32, 33) * 0.125 / BLUR_PX) ** 2)
     blurred = np.convolve(chord, kernel / kernel.sum(), mode='same')
     return x, blurred / blurred.max()
+
+
+def contrast_of(profiles: np.ndarray) -> np.ndarray:
+    """(...) share of the counts that the device takes at the middle of its (..., W) profiles, which are square roots of counts."""
+    return 1 - (profiles[..., profiles.shape[-1] // 2] / np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1), 1e-9)) ** 2
+
+
+def straight_on(contrast: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """What the contrast of a device would be if it were not seen at an angle, of this sine, to its axis (Beer-Lambert)."""
+    return 1 - (1 - contrast) ** np.clip(sine, 0.2, 1)
+
+
+def fading(profiles: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """(2,) logarithm of the darkness of the first and the last pieces, the darker of LAST, as a share of the usual one, of a device's (B, W) profiles.
+
+    A translucent device takes the same share of the beam everywhere, whatever lies behind it; the edge of a bone, taken for it, does not.
+    """
+    if len(profiles) <= 2 * LAST:
+        return np.zeros(2)
+    dark = np.log(np.clip(straight_on(contrast_of(profiles), sine), 1e-3, 1))
+    return np.maximum([dark[:LAST].max(), dark[-LAST:].max()] - middle(dark), -2.0)
 
 
 def own_shadow(profiles: np.ndarray, beside: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:

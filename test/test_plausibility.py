@@ -72,7 +72,8 @@ def device(**other):
     clear = dict(spline=straight, start=0.0, stop=0.06, end_sigma=np.full(2, 2e-4), open_end=np.array([False, False]),
                  covariance=np.eye(30) * 1e-10, s=S, presence=present, offset_px=np.zeros((len(S), 2)),
                  contrast=np.array([0.25, 0.25]), across=np.array([0.25, 0.25]), width=0.9, odd_width=0.0,
-                 likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)), alone=np.full(2, -1))
+                 likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)),
+                 fading=np.zeros(2), alone=np.full(2, -1))
     return Fit(**clear | other)
 
 
@@ -117,6 +118,7 @@ def test_a_clear_device_raises_no_doubt():
     (dict(presence=hidden(0.055, 0.07, 1)), Outcome.DIRECTIONS_DISAGREE, 'last end'),
     (dict(presence=faded(0.6)), Outcome.POORLY_EXPLAINED, 'fades towards its last end'),
     (dict(presence=faded(0.75), aside=np.array([[0.0, 0.0], [0.5, 0.45]])), Outcome.POORLY_EXPLAINED, 'fades towards its last end'),
+    (dict(fading=np.array([-0.4, 0.0])), Outcome.POORLY_EXPLAINED, 'fades towards its first end'),
     (dict(presence=device().presence - 0.4 * (S > 0.052)[:, None] * [0, 1], aside=np.array([[0.0, 0.0], [0.0, 0.4]]), likeness=np.array([0.98, 0.98])),
      Outcome.POORLY_EXPLAINED, 'in one plane it fades'),
     (dict(open_end=np.array([True, True])), Outcome.DIRECTIONS_DISAGREE, 'no tip'),
@@ -152,6 +154,25 @@ def test_two_clear_ends_outweigh_what_alone_would_be_a_doubt(other):
 def test_ends_are_clear_only_together(other):
     assert clear(device(**CLEAR)) and not clear(device(**CLEAR | other))
     assert_allclose(evidence(device(**CLEAR)), 2 * evidence(device()))
+
+
+ENTERS = dict(open_end=np.array([True, False]), end_sigma=np.array([0.0, 5e-5]), beyond=np.array([[1.0, 0.0], [0, 0]]))
+
+
+def test_where_a_prediction_has_it_one_clear_end_is_enough():
+    entering = device(**ENTERS, weakest=np.array([0.87, 0.98]))
+    assert 'follows another line' in doubt(entering, MIN_LENGTH_PX)[1]
+    assert doubt(entering, MIN_LENGTH_PX, expected=True) is None
+    assert clear(entering, expected=True) and not clear(entering)
+    assert not clear(device(**ENTERS | dict(end_sigma=np.array([0.0, 1.3e-4]))), expected=True)
+    assert not clear(device(open_end=np.array([True, True])), expected=True)
+    assert_allclose(evidence(entering, expected=True), 1.4 * np.sqrt(2) * evidence(entering))
+    assert not clear(device(**ENTERS, presence=faded(0.65)), expected=True)        # pale towards its end
+
+
+def test_what_a_prediction_has_may_not_fade():
+    assert 'fades' in doubt(device(**ENTERS, fading=np.array([0.0, -0.5])), MIN_LENGTH_PX, expected=True)[1]
+    assert doubt(device(**CLEAR, fading=np.array([0.0, -0.5])), MIN_LENGTH_PX) is None      # but clear ends on both sides are no edge's
 
 
 def test_with_an_end_that_a_line_hides_in_one_plane_the_rest_must_be_certain():
