@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,9 +14,11 @@ from .chains import Candidate, find_candidates
 from .data import Outcome
 from .fit import COARSE, EXTENSION_PX, Fit, fit
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
+from .follow import follow
 from .hop import other_lines
 from .matching import align
 from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence
+from .prior import Guess, borne_out, whole
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
 from .strips import Sheet, cut_along, half_width_range
@@ -37,7 +39,9 @@ EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it ...
 PROMISING = 0.08        # ... and that makes another try worth while
-ASIDE = 0.8             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew unless its ends are clear
+LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
+SHARP = 0.5e-3          # m: an end less certain than this may be another one
+ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew unless its ends are clear
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Detection:
     detail: str
     seen_px: tuple[np.ndarray | None, np.ndarray | None]    # (N, 2) image pixels as received
     doubt: tuple[Outcome, str] | None = None    # why the fit may not be believed
+    sure: bool = True       # whether nothing else in the images need be looked at
 
 
 Lines = tuple[Candidate | None, Candidate | None]       # of planes a and b; None where the line there is not the device's
@@ -85,8 +90,11 @@ class Attempt:
         return self.weight > PROMISING * np.sqrt(self.fit.stop - self.fit.start)
 
 
-def detect(sheet: Sheet, radius: float, min_length_px: float) -> Detection:
-    """Search both whole images (dark device, even noise) for the device of `radius` m."""
+def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | None = None, leads: Sequence[Fit] = ()) -> Detection:
+    """Search both whole images (dark device, even noise) for the device of `radius` m; a guess that a curve bears out speaks for that.
+
+    leads: fits to compare with what is found.
+    """
     views = sheet.views
     center = isocenter(views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in views]
@@ -96,31 +104,38 @@ def detect(sheet: Sheet, radius: float, min_length_px: float) -> Detection:
         if not found:
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
 
+    def judged(fitted: Fit, lines: Lines, start: np.ndarray) -> Attempt:
+        share = min((explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None), default=1.0)
+        expected = _expected(fitted, guess)
+        return Attempt(fitted, share, share * evidence(fitted, expected), doubt(fitted, min_length_px, expected), lines, start)
+
     def attempts(starts, times: int, clearing: bool = False) -> Iterator[Attempt]:
         """Fits, each as often again from where it came to lie: a start some px off may catch on another line where the next does not."""
         for points, lines, coarse in starts:
             for _ in range(times):
                 fitted = fit(sheet, points, radius, coarse, clearing=clearing)
-                if fitted is None:
-                    break
-                share = min(explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None)
-                attempt = Attempt(fitted, share, share * evidence(fitted), doubt(fitted, min_length_px), lines, points)
+                if fitted is None or not (any(lines) or _expected(fitted, guess)):
+                    break       # where the guess led to is nothing, or another line
+                attempt = judged(fitted, lines, points)
                 yield attempt
                 if not attempt.promising:
                     break
-                points = _curve(fitted)
+                points = fitted.curve(200)
 
-    tried, settled = [], None
+    tried, settled = [judged(f, (None, None), f.curve(200)) for f in leads], None
     for attempt in attempts((start for start in _pairs(views, candidates) if settled is None or start[1] == settled.lines), 1):
         tried.append(attempt)
         if settled is None and attempt.believed:
             settled = attempt       # but for the same lines read the other way round
-    if not tried:
-        return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
-    chosen = max(tried, key=lambda t: t.weight)
-    if not chosen.believed:
-        chosen = _second_look(partial(attempts, times=2, clearing=True), sheet, radius, candidates, widths, tried) or chosen
-    others = [t for t in tried if t.plain > RIVAL * chosen.plain and t.lines == chosen.lines and _apart(t.fit, chosen.fit) > APART]
+    chosen = max(tried, key=lambda t: t.weight, default=None)
+    if chosen is None or not chosen.believed:
+        path = None if guess is None else follow(sheet, guess, radius, clear=False)
+        if chosen is None and path is None:
+            return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
+        chosen = _second_look(partial(attempts, times=2, clearing=True), sheet, radius, candidates, widths, tried, path) or chosen
+    if chosen is None:
+        return Detection(None, Outcome.NO_CORRESPONDENCE, 'no line of plane a is one of plane b, and what is seen near the prediction is no device', best)
+    others = [t for t in tried if any(chosen.lines) and t.lines == chosen.lines and t.plain > RIVAL * chosen.plain and _apart(t.fit, chosen.fit) > APART]
     if others:      # lines along epipolar lines: only the ends tell which way round they belong together
         chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
         if second.fit.end_sigma.max() < SHARPER * chosen.fit.end_sigma.max():
@@ -143,10 +158,10 @@ def _pairs(views, candidates) -> Iterator[Start]:
         yield first_curve(views, curves[0][a], curves[1][b], alignment), (candidates[0][a], candidates[1][b]), 0
 
 
-def _second_look(attempts, sheet: Sheet, radius: float, candidates, widths, tried: list[Attempt]) -> Attempt | None:
+def _second_look(attempts, sheet: Sheet, radius: float, candidates, widths, tried: list[Attempt], path: np.ndarray | None) -> Attempt | None:
     """What `attempts` that take lines beside the device away find, starting anew; who tries so often must ask for more: clear ends, and nothing better beside."""
     more = []
-    for attempt in attempts(_again(sheet, radius, candidates, widths, tried)):
+    for attempt in attempts(_again(sheet, radius, candidates, widths, tried, path)):
         more.append(attempt)
         if attempt.believed and not blunt(attempt.fit).any():
             more += attempts(_beside(attempt, sheet, radius))       # the line taken away may be the device
@@ -156,12 +171,14 @@ def _second_look(attempts, sheet: Sheet, radius: float, candidates, widths, trie
     return max(good, key=lambda t: (t.believed, t.weight), default=None)
 
 
-def _again(sheet: Sheet, radius: float, candidates, widths, tried: list[Attempt]) -> Iterator[Start]:
-    """Where else it may be, when no pair of lines settled it: where the likeliest fits came to lie, where all of them started, and beside the likeliest;
-    where the other plane shows what one plane's line alone says; and the likeliest again with a search around their starts."""
+def _again(sheet: Sheet, radius: float, candidates, widths, tried: list[Attempt], path: np.ndarray | None) -> Iterator[Start]:
+    """Where else it may be, when no pair of lines settled it: along the (N, 3) `path` that a guess led to; where the likeliest fits came to lie, where all
+    of them started, and beside the likeliest; where the other plane shows what one plane's line alone says; and the likeliest again with a search around their starts."""
+    if path is not None:
+        yield path, (None, None), 0
     by_weight = sorted(tried, key=lambda t: -t.weight)
     likeliest = [t for t in by_weight if t.promising][:AGAIN]
-    yield from ((_curve(attempt.fit), attempt.lines, 0) for attempt in likeliest)
+    yield from ((attempt.fit.curve(200), attempt.lines, 0) for attempt in likeliest)
     yield from ((attempt.start, attempt.lines, 0) for attempt in by_weight)
     for attempt in likeliest:
         yield from _beside(attempt, sheet, radius)
@@ -181,29 +198,47 @@ def _beside(attempt: Attempt, sheet: Sheet, radius: float) -> Iterator[Start]:
     yield from ((points, attempt.lines, 0) for points in other_lines(sheet, attempt.fit, radius))
 
 
-def _curve(f: Fit) -> np.ndarray:
-    """(200, 3) m along the fitted device."""
-    return f.spline(np.linspace(f.start, f.stop, 200))
-
-
 def _apart(f: Fit, g: Fit) -> float:
     """m by which a fitted curve leaves another at most."""
-    return float(cKDTree(_curve(f)).query(_curve(g))[0].max())
+    return float(cKDTree(f.curve(200)).query(g.curve(200))[0].max())
 
 
 def _projected(f: Fit, view) -> np.ndarray:
     """(100, 2) image pixels as received, along the fitted device."""
-    return distort(view, project(view.P, f.spline(np.linspace(f.start, f.stop, 100))))
+    return distort(view, project(view.P, f.curve(100)))
 
 
-def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, beyond_px: float = EXTENSION_PX) -> Detection | None:
-    """Fit from where the device was, (N, 3) m; None where it is not there beyond doubt, so that the whole images must be searched."""
+def _expected(f: Fit, guess: Guess | None) -> bool:
+    """Whether a prediction has the device there."""
+    return guess is not None and borne_out(f.curve(100), guess)
+
+
+def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, guess: Guess | None = None, beyond_px: float = EXTENSION_PX) -> Detection | None:
+    """Fit from where the device was, (N, 3) m; None where it is not there. Where it may be another line, the whole images must be searched, too: `sure` tells."""
     fitted = fit(sheet, points, radius, 1, beyond_px)
-    if fitted is None or (fitted.aside.max() > ASIDE and not clear(fitted)) or (fitted.alone >= 0).any():
+    if fitted is None or blunt(fitted).any() or (fitted.alone >= 0).any():
         return None
-    if evidence(fitted) < CONVINCING * np.sqrt(fitted.stop - fitted.start) or doubt(fitted, min_length_px):
+    expected = _expected(fitted, guess)
+    if doubt(fitted, min_length_px, expected):
         return None
-    return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views))
+    sure = evidence(fitted, expected) > CONVINCING * np.sqrt(fitted.stop - fitted.start) and (clear(fitted) or fitted.aside.max() < ASIDE)
+    return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
+
+
+def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) -> Detection | None:
+    """The device near a guess; None where the images show none there. `sure` tells whether all of them must be searched, too.
+
+    sheet: of images with even noise; needed only within follow.reach_px.
+    """
+    start = follow(sheet, guess, radius)
+    if start is None or not borne_out(start, guess):
+        return None
+    found = track(sheet, radius, min_length_px, start, guess, LOOKED_PX)
+    if found is None or not _expected(found.fit, guess):
+        return None
+    f = found.fit
+    sharp = (f.open_end | (f.end_sigma < SHARP)).all()
+    return replace(found, sure=bool(found.sure and sharp and whole(f.stop - f.start, guess, sheet.views)))
 
 
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:

@@ -10,13 +10,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from .config import Config
 from .curve import arc_length, middle
-from .detect import Detection, track
-from .fit import Fit
 from .geometry import pixels_per_metre
 from .hop import darkest_path
-from .prior import Guess, borne_out, in_image, whole
+from .prior import Guess, in_image
 from .solver import Layout, solve
 from .spline import through
 from .profiles import shadow
@@ -31,33 +28,8 @@ BEND_COST = 0.7         # of a shift that changes from a strip to the next ...
 TRUST = 0.1             # ... and what the prediction counts in each strip: its error is the same in many
 SMOOTH = 2.0            # strips, over which the path is smoothed
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
-LOOKED_PX = 48.0        # past both ends of the path, which often stops short of the device's
 SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
-SHARP = 0.5e-3          # m: an end less certain than this may be another one
-
-
-def found_near(sheet: Sheet, config: Config, guess: Guess) -> Detection | None:
-    """The device near a guess; None where the images show none there that leaves no doubt, so that all of them must be searched.
-
-    sheet: of images with even noise; needed only within reach_px.
-    """
-    start = follow(sheet, guess, config.detection.robot_radius)
-    if start is None or not borne_out(start, guess):
-        return None
-    found = track(sheet, config.detection.robot_radius, config.detection.min_length_px, start, LOOKED_PX)
-    if found is None:
-        return None
-    f = found.fit
-    points = curve(f)
-    sharp = (f.open_end | (f.end_sigma < SHARP)).all()
-    believed = sharp and whole(f.stop - f.start, guess, sheet.views) and borne_out(points, guess)
-    return found if believed else None
-
-
-def curve(f: Fit) -> np.ndarray:
-    """(100, 3) m along the fitted device."""
-    return f.spline(np.linspace(f.start, f.stop, 100))
 
 
 def reach_px(guess: Guess, view) -> float:
@@ -65,8 +37,11 @@ def reach_px(guess: Guess, view) -> float:
     return WITHIN * float(guess.sigma.max()) * pixels_per_metre(view.P, guess.points) + BEYOND_PX + 50
 
 
-def follow(sheet: Sheet, guess: Guess, radius: float) -> np.ndarray | None:
-    """(M, 3) points in m along what looks most like the device of `radius` m near `guess`, base to tip; None where nothing does."""
+def follow(sheet: Sheet, guess: Guess, radius: float, clear: bool = True) -> np.ndarray | None:
+    """(M, 3) points in m along what looks most like the device of `radius` m near `guess`, base to tip; None where nothing does.
+
+    clear: only where it is seen nearly all the way.
+    """
     views = sheet.views
     scale = np.array([pixels_per_metre(v.P, guess.points) for v in views])
     spline = through(guess.points, BEYOND_PX / scale.max())
@@ -83,11 +58,11 @@ def follow(sheet: Sheet, guess: Guess, radius: float) -> np.ndarray | None:
     seen = np.zeros(gain.shape, bool)
     for g, s, c, v in zip(gain, seen, centers, views):
         start, stop = _darkest_stretch(g)
-        if stop - start < SHORTEST * in_image(v, c).sum() or (g[start:stop] > 0).mean() < SEEN:
+        if stop - start < 2 or clear and (stop - start < SHORTEST * in_image(v, c).sum() or (g[start:stop] > 0).mean() < SEEN):
             return None
         s[start:stop] = True
     both = np.nonzero(seen.all(axis=0))[0]
-    if len(both) < SHORTEST * seen.sum(axis=1).max():
+    if len(both) < 2 or clear and len(both) < SHORTEST * seen.sum(axis=1).max():
         return None
     shift = gaussian_filter1d(shifts[best].astype(float), SMOOTH, axis=1, mode='nearest')
     path = Measurement(shift, np.where(seen, 1.0, np.inf), gain, np.ones(2))

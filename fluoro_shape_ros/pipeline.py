@@ -12,11 +12,11 @@ from . import paper
 from .config import Config
 from .curve import arc_length, distance_to, even_steps, resample
 from .data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
-from .detect import Detection, detect, track
+from .detect import Detection, detect, found_near, track
 from .ends import tip_is_last
 from .field import border_distance, field_of_view
 from .fit import Fit
-from .follow import curve, found_near, reach_px
+from .follow import reach_px
 from .geometry import GeometryError, calibration_covariance, check, crop, distort, pixels_per_metre, project, undistort
 from .mask import subtract
 from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
@@ -50,27 +50,28 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
 def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
     """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images."""
     radius, polarity = config.detection.robot_radius, config.detection.polarity
-    found = None
+    near = []       # what is found near where it was, or should be
     if config.curve.tracking and prior.previous is not None:
         around = [region_around(v, prior.previous.points) for v in frame.views]
-        found = _near(around, track, images, fields, frame.views, polarity, radius, config.detection.min_length_px, prior.previous.points)
+        near += _near(around, track, images, fields, frame.views, polarity, radius, config.detection.min_length_px, prior.previous.points, guess)
         clock.lap('track')
-    if guess is not None and (found is None or not borne_out(curve(found.fit), guess)):
+    if guess is not None and not any(d.sure and borne_out(d.fit.curve(100), guess) for d in near):
         around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
-        found = _near(around, found_near, images, fields, frame.views, polarity, config, guess) or found
+        near += _near(around, found_near, images, fields, frame.views, polarity, radius, config.detection.min_length_px, guess)
         clock.lap('follow')
+    found = next((d for d in reversed(near) if d.sure), None)
     if found is None:
-        found = detect(_sheet(images, fields, frame.views, polarity), radius, config.detection.min_length_px)
+        found = detect(_sheet(images, fields, frame.views, polarity), radius, config.detection.min_length_px, guess, [d.fit for d in near])
         clock.lap('detect')
     seen = tuple(None if px is None else Centerline(px) for px in found.seen_px)
     if found.fit is None:
         return Reconstruction(found.outcome, found.detail, centerlines=seen, stage_seconds=clock.laps)
 
     f = found.fit
-    if guess is not None and borne_out(curve(f), guess):
+    if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)
     ends = f.spline(np.array([f.start, f.stop]))
-    known = _known_order(curve(f), prior, guess)
+    known = _known_order(f.curve(100), prior, guess)
     forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, known)
     shape = backbone(f, frame.views, forward, config.curve.backbone_spacing)
     clock.lap('backbone')
@@ -180,20 +181,20 @@ def _sheet(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Shee
     return Sheet.of(list(zip(images, regions)), [f[r] for f, r in zip(fields, regions)], parts, lambda i, out: stable_noise(i[0], polarity, i[1], out))
 
 
-def _near(regions, look, images, fields, views, polarity: str, *known) -> Detection | None:
-    """What `look` finds in these regions of both planes; None where it finds nothing, or something that may go on beyond them."""
+def _near(regions, look, images, fields, views, polarity: str, *known) -> list[Detection]:
+    """What `look` finds in these regions of both planes; nothing where it may go on beyond them."""
     found = look(_sheet(images, fields, views, polarity, regions), *known)
     if found is None:
-        return None
+        return []
     seen = []
     for (rows, columns), view, line in zip(regions, views, found.seen_px):
         last = np.array([columns.stop - columns.start, rows.stop - rows.start])
         cut_off = np.array([columns.start, rows.start]) > 0, np.array([columns.stop, rows.stop]) < [view.width, view.height]
         ends = line[[0, -1]]
         if ((ends < EDGE_PX) & cut_off[0] | (ends > last - EDGE_PX) & cut_off[1]).any():
-            return None
+            return []
         seen.append(line + [columns.start, rows.start])
-    return replace(found, seen_px=tuple(seen))
+    return [replace(found, seen_px=tuple(seen))]
 
 
 def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:

@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree
 from fluoro_shape_ros.chains import Candidate
 from fluoro_shape_ros.curve import arc_length, at_arc_length
 from fluoro_shape_ros.config import Config
-from fluoro_shape_ros.data import Outcome
+from fluoro_shape_ros.data import Outcome, Prior
 from fluoro_shape_ros.detect import candidates_of, detect, explained, track
 from fluoro_shape_ros.field import field_of_view
 from fluoro_shape_ros.geometry import project
 from fluoro_shape_ros.plausibility import evidence
 from fluoro_shape_ros.pipeline import reconstruct
+from fluoro_shape_ros.prior import look
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.strips import Sheet
@@ -130,6 +131,42 @@ def test_tracking_goes_on_from_where_the_device_was(scene, found):
 def test_tracking_gives_up_where_the_device_is_not(run, scene):
     assert track(prepared(run.without_device()), RADIUS, 60.0, scene.truth) is None
     assert track(prepared(scene.frame), RADIUS, 60.0, scene.truth + [0.02, 0.0, 0.0]) is None
+
+
+@pytest.mark.parametrize('other, sure', [
+    (dict(), True),
+    (dict(aside=np.array([[0.0, 0.0], [0.0, 0.7]]), end_sigma=np.full(2, 0.2e-3)), False),      # a line beside an end that is not clear
+    (dict(aside=np.array([[0.0, 0.0], [0.0, 0.7]]), end_sigma=np.full(2, 0.1e-3)), True),
+    (dict(end_sigma=np.array([0.1e-3, 0.5e-3])), None),                                         # blunt
+    (dict(alone=np.array([-1, 0])), None),
+    (dict(likeness=np.array([0.5, 0.5])), None),
+])
+def test_a_tracked_fit_in_doubt_wants_the_whole_images_searched(scene, found, monkeypatch, other, sure):
+    monkeypatch.setattr('fluoro_shape_ros.detect.fit', lambda *_: replace(found.fit, **other))
+    tracked = track(prepared(scene.frame), RADIUS, 60.0, scene.truth)
+    assert (None if tracked is None else tracked.sure) is sure
+
+
+def test_a_lead_counts_by_what_speaks_for_it(scene, found):
+    worse = replace(found.fit, likeness=found.fit.likeness - 0.1)
+    better = replace(found.fit, likeness=np.ones(2))
+    sheet = prepared(scene.frame)
+    assert detect(sheet, RADIUS, MIN_LENGTH, leads=[worse]).fit is not worse
+    result = detect(sheet, RADIUS, MIN_LENGTH, leads=[worse, better])
+    assert result.fit is better
+    for seen, before in zip(result.seen_px, found.seen_px):
+        assert np.median(cKDTree(before).query(seen)[0]) < 1.5
+
+
+def test_where_no_lines_belong_together_a_prediction_leads_to_the_device(scene, monkeypatch):
+    monkeypatch.setattr('fluoro_shape_ros.detect._pairs', lambda *_: iter(()))
+    monkeypatch.setattr('fluoro_shape_ros.detect.sweep', lambda *_: None)
+    sheet, bent = prepared(scene.frame), scene.truth + [[0, 0, 0.004]] * np.linspace(0, 1, len(scene.truth))[:, None] ** 2
+    assert detect(sheet, RADIUS, MIN_LENGTH).outcome is Outcome.NO_CORRESPONDENCE
+    result = detect(sheet, RADIUS, MIN_LENGTH, look(Prior(predicted=bent), VIEWS, 0.01)[0])
+    assert result.outcome is Outcome.OK and not result.doubt and mean_off(result.fit, scene.truth) < 0.08e-3
+    shifted = detect(sheet, RADIUS, MIN_LENGTH, look(Prior(predicted=bent + [0.03, 0.03, 0]), VIEWS, 0.01)[0])
+    assert shifted.outcome is Outcome.NO_CORRESPONDENCE
 
 
 def test_explained_is_the_share_of_the_line_near_the_curve(scene, found):
