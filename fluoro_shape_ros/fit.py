@@ -17,8 +17,8 @@ from .extent import BLURS_PX, End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .profiles import (WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces, shadow,
-                       straight_on)
+from .profiles import (OPAQUE, WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces,
+                       shadow, straight_on)
 from .strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
@@ -33,7 +33,7 @@ GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how m
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
-OPAQUE, ROUND = 0.5, 0.99      # contrast and likeness of a line that is a device, whatever its width
+ROUND = 0.99            # likeness of an opaque line that is a device, whatever its width
 END_PX = 24             # of the device, that must show it
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther ...

@@ -108,8 +108,8 @@ def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
     return (P[:2, :3] - (x[..., :2] / x[..., 2:])[..., None] * P[2, :3]) / x[..., 2, None, None]
 
 
-def calibration_covariance(views: tuple[View, View], X: np.ndarray, T: np.ndarray, sigma_px: float) -> np.ndarray:
-    """(N, 3, 3) m^2 of (N, 3) points of a curve with (N, 3) tangents that planes displaced by `sigma_px` along u and v cause.
+def calibration_covariance(views: tuple[View, View], X: np.ndarray, T: np.ndarray, sigma_px: float | np.ndarray) -> np.ndarray:
+    """(N, 3, 3) m^2 of (N, 3) points of a curve with (N, 3) tangents that planes displaced by `sigma_px`, one for all or (N,), along u and v cause.
 
     Each plane v shifts the curve by d_v = J_v dX across its projection, and both on average along it:
     n_v J_v dX = n_v d_v, sum_v t_v (J_v dX - d_v) / |J_v T| = 0, with n_v and t_v across and along the projection. Where the curve runs along epipolar
@@ -124,7 +124,7 @@ def calibration_covariance(views: tuple[View, View], X: np.ndarray, T: np.ndarra
     tangential = np.einsum('vnk,vnki->ni', along / speed, J) / np.sqrt((1 / speed**2).sum(axis=0))
     A = np.concatenate([normal, tangential[:, None]], axis=1)
     information = A.transpose(0, 2, 1) @ A + POINT * (J.transpose(0, 1, 3, 2) @ J).sum(axis=0)
-    return np.linalg.inv(information + np.eye(3)) * sigma_px**2      # nothing is known less well than to sigma_px metres
+    return np.linalg.inv(information + np.eye(3)) * np.square(sigma_px)[..., None, None]      # nothing is known less well than to sigma_px metres
 
 
 def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:

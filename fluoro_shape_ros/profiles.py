@@ -11,6 +11,7 @@ from .curve import middle
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips
 STRETCH = 3             # pieces: longer than what hides a device
+OPAQUE = 0.5            # contrast of a device that hardly lets anything through
 LAST = 2                # pieces at an end that must be about as dark as the others
 OUTER = 0.02            # of a shadow: what is fainter lies beside the device
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
@@ -114,11 +115,13 @@ def straight_on(contrast: np.ndarray, sine: np.ndarray) -> np.ndarray:
 def fading(profiles: np.ndarray, sine: np.ndarray) -> np.ndarray:
     """(2,) logarithm of the darkness of the first and the last pieces, the darker of LAST, as a share of the usual one, of a device's (B, W) profiles.
 
-    A translucent device takes the same share of the beam everywhere, whatever lies behind it; the edge of a bone, taken for it, does not.
+    A translucent device takes the same share of the beam everywhere, whatever lies behind it, and an opaque one nearly all of it, at whatever angle it is
+    seen; the edge of a bone, taken for it, does not.
     """
     if len(profiles) <= 2 * LAST:
         return np.zeros(2)
-    dark = np.log(np.clip(straight_on(contrast_of(profiles), sine), 1e-3, 1))
+    contrast = contrast_of(profiles)
+    dark = np.log(np.clip(contrast if middle(contrast) > OPAQUE else straight_on(contrast, sine), 1e-3, 1))
     return np.maximum([dark[:LAST].max(), dark[-LAST:].max()] - middle(dark), -2.0)
 
 

@@ -12,11 +12,14 @@ from scipy.spatial.transform import Rotation
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Distortion, Frame, Outcome, Prior, Shape
-from fluoro_shape_ros.geometry import decompose, make_view, undistort
-from fluoro_shape_ros.pipeline import reconstruct
+from fluoro_shape_ros.field import field_of_view
+from fluoro_shape_ros.fit import fit
+from fluoro_shape_ros.geometry import calibration_covariance, decompose, make_view, undistort
+from fluoro_shape_ros.pipeline import backbone, reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.xray import Exposure
+from fluoro_shape_ros.strips import Sheet
 
 SIZE = 512
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
@@ -48,6 +51,21 @@ def config(scene):
 @pytest.fixture(scope='module')
 def answer(scene, config):
     return reconstruct(scene.frame, config)
+
+
+def test_what_a_fit_leaves_over_counts_like_a_calibration_error(scene):
+    sheet = Sheet.of([np.sqrt(i, dtype=np.float32) for i in scene.frame.images], [field_of_view(i) for i in scene.frame.images], VIEWS)
+    f = fit(sheet, scene.truth, scene.radius)
+    even = replace(f, offset_px=np.zeros_like(f.offset_px))
+    beside = replace(even, offset_px=even.offset_px + (f.s > f.stop - 20 * (f.s[1] - f.s[0]))[:, None] * [0.0, 0.8])
+    plain, more = (backbone(x, VIEWS, True, 1e-3) for x in (even, beside))
+    tangent = f.spline(np.array([f.stop]), 1)
+    assert_allclose((more.covariance - plain.covariance)[-1], calibration_covariance(VIEWS, plain.points[-1:], tangent, 0.8)[0], rtol=1e-6, atol=1e-16)
+    assert_allclose(more.covariance[0], plain.covariance[0])
+    alone = replace(even, offset_px=np.where(np.arange(len(f.s)) % 5 == 0, 2.0, 0.0)[:, None] * [1.0, 1.0])     # one strip in five is noise, or hidden
+    assert_allclose(backbone(alone, VIEWS, True, 1e-3).covariance, plain.covariance)
+    unknown = replace(even, offset_px=np.full_like(f.offset_px, np.nan))
+    assert_allclose(backbone(unknown, VIEWS, True, 1e-3).covariance, plain.covariance)
 
 
 def off(points, curve):

@@ -262,6 +262,7 @@ def test_what_fades_towards_an_end_by_hand():
     assert_allclose(fading(darkened(*half), np.ones(6)), [0, np.log(0.5)], atol=1e-12)
     assert_allclose(fading(darkened(*half[:5], 0.2), np.ones(6)), 0, atol=1e-12)               # one piece may be hidden
     assert_allclose(fading(darkened(*usual), np.r_[np.ones(4), 0.5, 0.5]), [0, np.log((1 - 0.8**0.5) / 0.2)], atol=1e-12)      # it should look darker there
+    assert_allclose(fading(darkened(*np.full(6, 0.8)), np.r_[np.ones(4), 0.5, 0.5]), 0, atol=1e-12)     # opaque: it does not
     assert_allclose(fading(darkened(*np.r_[np.full(4, 0.2), -0.1, 0.0]), np.ones(6)), [0, -2], atol=1e-12)
     assert_allclose(fading(darkened(0.2, 0.2, 0.1, 0.1), np.ones(4)), 0, atol=1e-12)                       # too short to tell
 
