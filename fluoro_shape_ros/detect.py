@@ -17,7 +17,7 @@ from .geometry import distort, fundamental, isocenter, pixels_per_metre, project
 from .follow import follow
 from .hop import other_lines
 from .matching import align
-from .plausibility import CLEARER, alike_device, blunt, clear, doubt, evidence
+from .plausibility import CLEARER, MIN_WEAKEST, alike_device, blunt, clear, doubt, evidence
 from .prior import Guess, borne_out, whole
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
@@ -41,7 +41,7 @@ CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypot
 PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
-ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew unless its ends are clear
+ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
     expected = _expected(fitted, guess)
     if doubt(fitted, min_length_px, expected):
         return None
-    sure = evidence(fitted, expected) > CONVINCING * np.sqrt(fitted.stop - fitted.start) and (clear(fitted) or fitted.aside.max() < ASIDE)
+    sure = evidence(fitted, expected) > CONVINCING * np.sqrt(fitted.stop - fitted.start) and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
 
 

@@ -135,14 +135,14 @@ def test_tracking_gives_up_where_the_device_is_not(run, scene):
 
 @pytest.mark.parametrize('other, sure', [
     (dict(), True),
-    (dict(aside=np.array([[0.0, 0.0], [0.0, 0.7]]), end_sigma=np.full(2, 0.2e-3)), False),      # a line beside an end that is not clear
-    (dict(aside=np.array([[0.0, 0.0], [0.0, 0.7]]), end_sigma=np.full(2, 0.1e-3)), True),
+    (dict(aside=np.array([[0.0, 0.0], [0.0, 0.7]])), False),      # a line beside an end
+    (dict(weakest=np.array([0.89, 1.0]), end_sigma=np.full(2, 0.1e-3)), False),     # its ends are clear, but part of it is something else
     (dict(end_sigma=np.array([0.1e-3, 0.5e-3])), None),                                         # blunt
     (dict(alone=np.array([-1, 0])), None),
     (dict(likeness=np.array([0.5, 0.5])), None),
 ])
 def test_a_tracked_fit_in_doubt_wants_the_whole_images_searched(scene, found, monkeypatch, other, sure):
-    monkeypatch.setattr('fluoro_shape_ros.detect.fit', lambda *_: replace(found.fit, **other))
+    monkeypatch.setattr('fluoro_shape_ros.detect.fit', lambda *_: replace(found.fit, **dict(aside=np.zeros((2, 2))) | other))
     tracked = track(prepared(scene.frame), RADIUS, 60.0, scene.truth)
     assert (None if tracked is None else tracked.sure) is sure
 
