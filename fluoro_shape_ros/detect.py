@@ -17,7 +17,7 @@ from .geometry import distort, fundamental, isocenter, pixels_per_metre, project
 from .follow import follow
 from .hop import other_lines
 from .matching import align
-from .plausibility import CLEARER, MIN_WEAKEST, alike_device, blunt, clear, doubt, evidence
+from .plausibility import CLEARER, EXPECTED, MIN_WEAKEST, alike_device, blunt, clear, doubt, evidence
 from .prior import Guess, borne_out, whole
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
@@ -35,6 +35,7 @@ FLIPPED = 0.7           # alignment of a pair of lines read the other way round,
 RIVAL, APART = 0.7, 5e-3        # ... and the weight of a curve that far from the chosen one, m, as a share of its weight, that makes it a rival ...
 SHARPER = 3.5           # ... unless the ends of one are clearer by this, as the planes agree on them
 BESIDE = 2e-3           # m: as far from a curve for which more speaks, but for clear ends, one found by taking lines away is not believed
+UNASKED = 0.8           # the share of a fit that no line of the images led to: it must have more for it than one that some did
 EXPLAINED_PX = 3.0
 MIN_EXPLAINED = 0.4     # less of a line than this, and it is another line
 CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypothesis beside it ...
@@ -70,10 +71,13 @@ class Attempt:
     doubt: tuple[Outcome, str] | None
     lines: Lines
     start: np.ndarray       # (M, 3) m
+    expected: bool          # whether a prediction has it there
 
     @property
     def convincing(self) -> bool:
-        return self.weight > CONVINCING * np.sqrt(self.fit.stop - self.fit.start)
+        """Whether enough speaks for it; two clear ends must do without a prediction."""
+        needed = CONVINCING * (EXPECTED if self.expected and clear(self.fit) else 1.0)
+        return self.weight > needed * np.sqrt(self.fit.stop - self.fit.start)
 
     @property
     def plain(self) -> float:
@@ -105,9 +109,9 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
 
     def judged(fitted: Fit, lines: Lines, start: np.ndarray) -> Attempt:
-        share = min((explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None), default=1.0)
+        share = min((explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None), default=UNASKED)
         expected = _expected(fitted, guess)
-        return Attempt(fitted, share, share * evidence(fitted, expected), doubt(fitted, min_length_px, expected), lines, start)
+        return Attempt(fitted, share, share * evidence(fitted, expected), doubt(fitted, min_length_px, expected), lines, start, expected)
 
     def attempts(starts, times: int, clearing: bool = False) -> Iterator[Attempt]:
         """Fits, each as often again from where it came to lie: a start some px off may catch on another line where the next does not."""
@@ -221,7 +225,8 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
     expected = _expected(fitted, guess)
     if doubt(fitted, min_length_px, expected):
         return None
-    sure = evidence(fitted, expected) > CONVINCING * np.sqrt(fitted.stop - fitted.start) and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
+    speaks = evidence(fitted, expected and not clear(fitted)) / np.sqrt(fitted.stop - fitted.start)      # two clear ends must do without a prediction
+    sure = speaks > CONVINCING and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
 
 

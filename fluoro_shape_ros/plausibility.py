@@ -31,7 +31,7 @@ CLEAR, CLEAR_PX = 0.12e-3, 0.4          # the same, up to which an end is clear:
 CLEAR_BEYOND = 0.4      # ... and darkness past it ...
 CLEARER = 2.0           # ... so that this many times as much speaks for a fit with two such ends, and its profile may be less round:
 CLEAR_LIKENESS, CLEAR_WEAKEST = 0.93, 0.85
-EXPECTED = 1.4          # times as much speaks for a fit where a prediction has the device, unless that counts as clear
+EXPECTED = 1.4          # times as much speaks for a fit where a prediction has the device
 MIN_CONTRAST = 0.02
 MIN_EVIDENCE = 0.4      # see `evidence`, for a length of 1 m
 CERTAIN, CERTAIN_WEAKEST = 0.6, 0.95    # the same, and the least likeness in a row, of a fit with an end that only one plane shows
@@ -51,7 +51,7 @@ def evidence(f: Fit, expected: bool = False) -> float:
     alike = np.exp(-0.5 * (np.log(contrast_ratio(f)) / CONTRAST_RATIO) ** 2)
     goes_on = np.clip(f.beyond[~f.open_end].max(axis=1), 0, 1)
     closed = float(np.exp(-2 * (goes_on**2).sum())) if len(goes_on) else NO_TIP
-    favour = CLEARER if clear(f, expected) else EXPECTED if expected else 1.0
+    favour = (CLEARER ** (0.5 * np.count_nonzero(~f.open_end)) if clear(f, expected) else 1.0) * (EXPECTED if expected else 1.0)
     return float(np.sqrt(f.stop - f.start) * shown(f).min() * alike * closed * alike_device(f.odd_width, f.likeness) * favour)
 
 

@@ -147,12 +147,12 @@ def test_a_tracked_fit_in_doubt_wants_the_whole_images_searched(scene, found, mo
     assert (None if tracked is None else tracked.sure) is sure
 
 
-def test_a_lead_counts_by_what_speaks_for_it(scene, found):
-    worse = replace(found.fit, likeness=found.fit.likeness - 0.1)
+def test_a_lead_counts_by_what_speaks_for_it_but_less_than_what_lines_led_to(scene, found, monkeypatch):
     better = replace(found.fit, likeness=np.ones(2))
     sheet = prepared(scene.frame)
-    assert detect(sheet, RADIUS, MIN_LENGTH, leads=[worse]).fit is not worse
-    result = detect(sheet, RADIUS, MIN_LENGTH, leads=[worse, better])
+    assert detect(sheet, RADIUS, MIN_LENGTH, leads=[better]).fit is not better
+    monkeypatch.setattr('fluoro_shape_ros.detect.UNASKED', 1.0)
+    result = detect(sheet, RADIUS, MIN_LENGTH, leads=[replace(better, likeness=np.full(2, 0.9)), better])
     assert result.fit is better
     for seen, before in zip(result.seen_px, found.seen_px):
         assert np.median(cKDTree(before).query(seen)[0]) < 1.5
