@@ -13,11 +13,11 @@ from .centerline import find_ridges, ridge_scale, shrinking
 from .chains import Candidate, find_candidates
 from .data import Outcome
 from .fit import COARSE, EXTENSION_PX, Fit, fit
-from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .follow import follow
+from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .hop import other_lines
 from .matching import align
-from .plausibility import CLEARER, EXPECTED, MIN_WEAKEST, alike_device, blunt, clear, doubt, evidence
+from .plausibility import CLEARER, MIN_WEAKEST, alike_device, blunt, clear, doubt, evidence
 from .prior import Guess, borne_out, whole
 from .start import first_curve
 from .profiles import apparent_width, likeness, odd_width, pieces
@@ -75,9 +75,7 @@ class Attempt:
 
     @property
     def convincing(self) -> bool:
-        """Whether enough speaks for it; two clear ends must do without a prediction."""
-        needed = CONVINCING * (EXPECTED if self.expected and clear(self.fit) else 1.0)
-        return self.weight > needed * np.sqrt(self.fit.stop - self.fit.start)
+        return self.share * _speaks(self.fit, self.expected) > CONVINCING
 
     @property
     def plain(self) -> float:
@@ -108,7 +106,7 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
         if not found:
             return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
 
-    def judged(fitted: Fit, lines: Lines, start: np.ndarray) -> Attempt:
+    def attempt_of(fitted: Fit, lines: Lines, start: np.ndarray) -> Attempt:
         share = min((explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None), default=UNASKED)
         expected = _expected(fitted, guess)
         return Attempt(fitted, share, share * evidence(fitted, expected), doubt(fitted, min_length_px, expected), lines, start, expected)
@@ -118,15 +116,17 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
         for points, lines, coarse in starts:
             for _ in range(times):
                 fitted = fit(sheet, points, radius, coarse, clearing=clearing)
-                if fitted is None or not (any(lines) or _expected(fitted, guess)):
-                    break       # where the guess led to is nothing, or another line
-                attempt = judged(fitted, lines, points)
+                if fitted is None:
+                    break
+                attempt = attempt_of(fitted, lines, points)
+                if not (any(lines) or attempt.expected):
+                    break       # the guess led to another line
                 yield attempt
                 if not attempt.promising:
                     break
                 points = fitted.curve(200)
 
-    tried, settled = [judged(f, (None, None), f.curve(200)) for f in leads], None
+    tried, settled = [attempt_of(f, (None, None), f.curve(200)) for f in leads], None
     for attempt in attempts((start for start in _pairs(views, candidates) if settled is None or start[1] == settled.lines), 1):
         tried.append(attempt)
         if settled is None and attempt.believed:
@@ -212,6 +212,11 @@ def _projected(f: Fit, view) -> np.ndarray:
     return distort(view, project(view.P, f.curve(100)))
 
 
+def _speaks(f: Fit, expected: bool) -> float:
+    """Its evidence, for a length of 1 m; a fit with two clear ends must do without a prediction."""
+    return evidence(f, expected and not clear(f)) / np.sqrt(f.stop - f.start)
+
+
 def _expected(f: Fit, guess: Guess | None) -> bool:
     """Whether a prediction has the device there."""
     return guess is not None and borne_out(f.curve(100), guess)
@@ -225,8 +230,7 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
     expected = _expected(fitted, guess)
     if doubt(fitted, min_length_px, expected):
         return None
-    speaks = evidence(fitted, expected and not clear(fitted)) / np.sqrt(fitted.stop - fitted.start)      # two clear ends must do without a prediction
-    sure = speaks > CONVINCING and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
+    sure = _speaks(fitted, expected) > CONVINCING and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
 
 
