@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,13 +81,13 @@ class Solution:
     """A spline after one step of the solver."""
 
     spline: Spline3
-    information: np.ndarray     # (BAND, 3 n) 1/m^2 of the control points, its lower band
+    information: Callable[[], np.ndarray]   # (BAND, 3 n) 1/m^2 of the control points, its lower band; worth computing of the last step only
     offset_px: np.ndarray       # (2, N) of the device from the curve, after the step; NaN where not measured
     moved_px: float             # how far the step went, at most
 
     def covariance(self) -> np.ndarray:
         """(3 n, 3 n) m^2 of the control points."""
-        return dpbsv(self.information, np.eye(self.information.shape[1]), lower=1)[1]
+        return dpbsv(self.information(), np.eye(self.spline.control.size), lower=1)[1]
 
 
 @dataclass(frozen=True)
@@ -153,12 +153,16 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
         moved = (rows @ step[layout.unknowns][..., None])[..., 0]
         r = d - moved
     plane = [slice(0, at.shape[1]), slice(at.shape[1], None)]      # of the table's columns
-    together = np.empty_like(w)
     offset = np.full((2, len(layout.s)), np.nan)
     for v, c in enumerate(plane):
-        together[:, c] = _together((r[:, c] * np.sqrt(w[:, c]))[used[:, c]])
         offset[v, at[used[:, c]]] = r[:, c][used[:, c]]
-    information = layout.matrix((columns * (w / together)[:, None]) @ rows) + prior
+
+    def information() -> np.ndarray:
+        together = np.empty_like(w)
+        for c in plane:
+            together[:, c] = _together((r[:, c] * np.sqrt(w[:, c]))[used[:, c]])
+        return layout.matrix((columns * (w / together)[:, None]) @ rows) + prior
+
     after = Spline3(spline.start, spline.stop, spline.control + step.reshape(n, 3))
     return Solution(after, information, offset, float(np.abs(moved[used]).max(initial=0.0)))
 

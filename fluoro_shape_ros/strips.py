@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from .curve import middle
 from .data import View
@@ -78,7 +77,7 @@ class Sheet:
         whole = np.empty((top[-1] + heights[-1] + MARGIN_PX, width), np.float32)
         exposed = np.zeros(whole.shape, np.uint8)
         planes = [whole[t:t + len(f), :f.shape[1]] for t, f in zip(top, fields)]
-        both(draw, images, planes)
+        both(draw, images, planes, pixels=whole.size)
         for t, plane, f in zip(top, planes, fields):
             h, w = f.shape
             exposed[t:t + h, :w] = f
@@ -206,7 +205,7 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
     square = rest * rest
     limit = 9 * noise**2
-    misfit = uniform_filter1d(np.minimum(np.einsum('vnw->vn', square) / (width - 5), limit), TOGETHER, axis=1) / noise**2
+    misfit = cv2.blur(np.minimum(np.einsum('vnw->vn', square) / (width - 5), limit), (TOGETHER, 1), borderType=cv2.BORDER_REFLECT) / noise**2
     variance *= 1 + TOGETHER * np.maximum(misfit - MISFIT, 0)
     odd = np.einsum('vnw->vn', np.minimum(square, limit[..., None])) > 3.5 * width * noise**2   # another edge runs through: not to be trusted
     variance[~inside | odd | np.isnan(variance)] = np.inf
