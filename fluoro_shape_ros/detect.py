@@ -42,7 +42,9 @@ CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypot
 PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
-ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
+ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew ...
+BEARS_OUT = 1.4         # ... but where a prediction and clear ends speak for it, with so much evidence for a length of 1 m
+JUMPED = 4e-3           # m: an end that has moved farther since the pair before may have slipped on to another line
 
 
 @dataclass(frozen=True)
@@ -222,15 +224,27 @@ def _expected(f: Fit, guess: Guess | None) -> bool:
     return guess is not None and borne_out(f.curve(100), guess)
 
 
-def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, guess: Guess | None = None, beyond_px: float = EXTENSION_PX) -> Detection | None:
-    """Fit from where the device was, (N, 3) m; None where it is not there. Where it may be another line, the whole images must be searched, too: `sure` tells."""
+def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, guess: Guess | None = None) -> Detection | None:
+    """The device near where it was, (N, 3) m; None where it is not there. Where it may be another line, the whole images must be searched, too: `sure` tells."""
+    found = _fit_from(sheet, radius, min_length_px, points, guess, EXTENSION_PX)
+    if found is None:
+        return None
+    ends, before = found.fit.curve(2), points[[0, -1]]
+    jumped = min(np.linalg.norm(e - before, axis=1).max() for e in (ends, ends[::-1])) > JUMPED
+    return replace(found, sure=found.sure and not jumped)
+
+
+def _fit_from(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, guess: Guess | None, beyond_px: float) -> Detection | None:
+    """A fit that starts at (N, 3) m and may be believed; whether it is `sure`."""
     fitted = fit(sheet, points, radius, 1, beyond_px)
     if fitted is None or blunt(fitted).any() or (fitted.alone >= 0).any():
         return None
     expected = _expected(fitted, guess)
     if doubt(fitted, min_length_px, expected):
         return None
-    sure = _speaks(fitted, expected) > CONVINCING and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
+    speaks = _speaks(fitted, expected)
+    bare = fitted.aside.max() < ASIDE or (expected and speaks > BEARS_OUT and clear(fitted))
+    sure = speaks > CONVINCING and bare and fitted.weakest.min() > MIN_WEAKEST
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
 
 
@@ -242,7 +256,7 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     start = follow(sheet, guess, radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = track(sheet, radius, min_length_px, start, guess, LOOKED_PX)
+    found = _fit_from(sheet, radius, min_length_px, start, guess, LOOKED_PX)
     if found is None or not _expected(found.fit, guess):
         return None
     f = found.fit

@@ -18,7 +18,6 @@ OWN = 0.5               # what the darkness of the fitted line counts, so that a
 MOVE_COST = 0.1         # ... and of a path that moves by a px from a strip to the next
 SMOOTH = 2.0            # strips, over which the path is smoothed
 OTHER_PX = 3.0          # a path nearer than that is no other line
-MOVES = np.array([0, -1, 1])
 
 
 def other_lines(sheet: Sheet, f: Fit, radius: float) -> list[np.ndarray]:
@@ -54,10 +53,11 @@ def darkest_path(score: np.ndarray, move_cost: float) -> np.ndarray:
     for before, here in zip(total[:-1], total[1:]):
         came = np.maximum(before[:, :-2], before[:, 2:]) - move_cost
         here[:, 1:-1] += np.maximum(came, before[:, 1:-1], out=came)
-    plane, column = np.arange(len(score)), total[-1].argmax(axis=1)
+    left, right = total[:-1, :, :-2], total[:-1, :, 2:]
+    moves = np.where(np.maximum(left, right) - move_cost > total[:-1, :, 1:-1], np.where(right > left, 1, -1), 0)     # (N - 1, V, W) from each column of the next row
+    plane, column = np.arange(len(score)), total[-1, :, 1:-1].argmax(axis=1)
     columns = [column]
-    for before in total[-2::-1]:
-        reach = before[plane[:, None], column[:, None] + MOVES] - move_cost * np.abs(MOVES)
-        column = column + MOVES[reach.argmax(axis=1)]
+    for move in moves[::-1]:
+        column = column + move[plane, column]
         columns.append(column)
-    return np.stack(columns[::-1], axis=1) - 1
+    return np.stack(columns[::-1], axis=1)

@@ -97,6 +97,13 @@ def test_a_device_that_jumps_is_found_in_the_same_pair(there):
     assert is_right(answer, after) and same(answer.shape, search(after).shape)
 
 
+def test_an_end_that_slips_far_is_compared_with_what_all_of_the_images_show():
+    before, now = pictures([run().shape, moved(0.005)])
+    first = search(before).shape
+    answer = reconstruct(now.frame, CONFIG, Prior(previous=first))
+    assert {'track', 'detect'} <= set(answer.stage_seconds) and same(answer.shape, search(now).shape)
+
+
 @pytest.mark.parametrize('missed', [1, 3, 10])
 def test_missed_pairs_do_no_harm(missed):
     before, after = pictures([run().shape, moved((missed + 1) * STEP)])
