@@ -42,8 +42,7 @@ CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypot
 PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
-ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew ...
-BEARS_OUT = 1.4         # ... but where a prediction and clear ends speak for it, with so much evidence for a length of 1 m
+ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 JUMPED = 4e-3           # m: an end that has moved farther since the pair before may have slipped on to another line
 
 
@@ -242,9 +241,7 @@ def _fit_from(sheet: Sheet, radius: float, min_length_px: float, points: np.ndar
     expected = _expected(fitted, guess)
     if doubt(fitted, min_length_px, expected):
         return None
-    speaks = _speaks(fitted, expected)
-    bare = fitted.aside.max() < ASIDE or (expected and speaks > BEARS_OUT and clear(fitted))
-    sure = speaks > CONVINCING and bare and fitted.weakest.min() > MIN_WEAKEST
+    sure = _speaks(fitted, expected) > CONVINCING and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
 
 
