@@ -60,7 +60,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     for package in ROS_PACKAGES:
         cli.need(package, 'ros')
     import rclpy
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.qos_overriding_options import InvalidQosOverridesError
 
@@ -85,13 +85,12 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
         if 'parse' not in message:
             raise cli.ToolError(message) from error
         return _refuse(message)
-    executor = _executor()
+    executor = SingleThreadedExecutor()
     executor.add_node(node)
     gc.freeze()     # what the imports left stays anyway: to look through all of it now and then would hold up a pair for some 50 ms
     try:
         if not told_to_stop.is_set():   # it may have come before rclpy's handlers
-            while rclpy.ok():
-                executor.spin_once(timeout_sec=1.0)     # without a timeout the events executor of rclpy 7.1 waits busily: its deadline overflows
+            executor.spin()
     except (ExternalShutdownException, rclpy_implementation.RCLError):
         if rclpy.ok():      # else the signal came between rclpy's look at the context and its use
             raise
@@ -104,16 +103,6 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
             os._exit(0)
         node.destroy_node()
     return 0
-
-
-def _executor():
-    """One that is told what has come. Others collect all they wait for anew, in Python, before each message: half a core at 30 pairs/s, and the worker has to wait."""
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:     # rclpy before 7.1.4
-        from rclpy.executors import SingleThreadedExecutor
-        return SingleThreadedExecutor()
-    return EventsExecutor()
 
 
 def _refuse(message) -> int:

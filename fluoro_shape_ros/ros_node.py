@@ -58,6 +58,7 @@ class FluoroShapeNode(Node):
         overridable = QoSOverridingOptions.with_default_policies()
         self._outputs = Outputs(self)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10), qos_overriding_options=overridable)
+        self._answered = self.create_guard_condition(self._report_changes)
         self._worker = Worker(self._work, self._failed)
         self._inputs = None
         self._listen()
@@ -216,14 +217,9 @@ class FluoroShapeNode(Node):
         frame, result = (None, adapted) if isinstance(adapted, Reconstruction) else (adapted, self._reconstruct(job, adapted))
         if result is not None:
             self._tally.result(result, time.monotonic() - job.arrived)
-        self._answered()
+        self._answered.trigger()
         if result is not None:
             self._outputs.explain(job, frame, result)
-
-    def _answered(self) -> None:
-        """Have the executor's thread tell what is new."""
-        if self.executor is not None:
-            self.executor.create_task(self._report_changes)
 
     def _reconstruct(self, job: Job, frame: Frame) -> Reconstruction | None:
         """The published answer to a frame; None where it went into the mask or was overtaken by a reset."""
@@ -249,7 +245,7 @@ class FluoroShapeNode(Node):
             self.get_logger().error(''.join(traceback.format_exception(error)))
         self._tally.event(bug)
         self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}'), latency_s)
-        self._answered()
+        self._answered.trigger()
 
     def _statuses(self) -> list:
         gap = self._pairer.gap_ns

@@ -34,18 +34,6 @@ def test_images_before_any_camera_info_a_qos_override_and_sigint(log):
         assert node.end(signal.SIGINT) == 0 and 'Traceback' not in node.log
 
 
-def test_an_rclpy_without_events_executor(log):
-    code = """if True:
-        import sys
-        sys.modules['rclpy.experimental'] = None
-        from fluoro_shape_ros.node import main
-        sys.exit(main())"""
-    with NodeProcess(log, ros.RADIUS, BASE, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
-        assert client.connected(), node.log
-        client.good()
-        assert node.end(signal.SIGINT) == 0 and 'Traceback' not in node.log
-
-
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT], ids=lambda s: s.name)
 def test_a_signal_in_the_middle_of_a_pair(log, number):
     """A pair that never ends: the worker's thread can't be joined."""
