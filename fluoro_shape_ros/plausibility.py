@@ -95,8 +95,7 @@ def doubt(f: Fit, min_length_px: float, expected: bool = False) -> tuple[Outcome
     share = shown(f)
     if share.min() < MIN_SHOWN:
         return Outcome.POORLY_EXPLAINED, f'only {100 * share.min():.0f} % of it are seen in plane {"ab"[int(share.argmin())]}'
-    alike, each, by = evidence(f), ends_shown(f), f.alone
-    speaks = alike / np.sqrt(f.stop - f.start)      # of where it ends a prediction tells nothing
+    speaks, each, by = evidence(f) / np.sqrt(f.stop - f.start), ends_shown(f), f.alone        # of where it ends a prediction tells nothing
     alone = by >= 0
     if alone.any() and (speaks < CERTAIN or f.weakest.min() < CERTAIN_WEAKEST):
         return Outcome.POORLY_EXPLAINED, 'a line hides one of its ends in one plane, and too little else speaks for it'
@@ -117,7 +116,7 @@ def doubt(f: Fit, min_length_px: float, expected: bool = False) -> tuple[Outcome
             return Outcome.POORLY_EXPLAINED, f'in one plane it fades towards its {name} end, and there is a line beside it'
     if all(f.open_end):
         return Outcome.DIRECTIONS_DISAGREE, 'it leaves the field at both ends: no tip is seen'
-    if (evidence(f, expected) if expected else alike) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
+    if evidence(f, expected) < MIN_EVIDENCE * np.sqrt(f.stop - f.start):
         return Outcome.POORLY_EXPLAINED, 'too little speaks for it being one device in both planes (likeness, darkness, ends)'
     return None
 
