@@ -68,6 +68,8 @@ class Prior:
 
     previous: Shape | None = None           # the result of the pair before
     previous_stamp_ns: int | None = None
+    before: Shape | None = None             # the result before that
+    before_stamp_ns: int | None = None
     masks: tuple[np.ndarray, np.ndarray] | None = None  # (H, W) float32, device-free mean image of each plane
     predicted: np.ndarray | None = None     # (N, 3) a kinematic model's guess, base to tip, m
     prediction_fault: str = ''              # why the newest guess can't be used; empty where it can, or where there is none

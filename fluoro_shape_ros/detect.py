@@ -43,7 +43,7 @@ PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
 ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
-JUMPED = 4e-3           # m: an end that has moved farther since the pair before may have slipped on to another line
+JUMPED = 4e-3           # m: an end farther from where it was, or should be by now, may have slipped on to another line
 
 
 @dataclass(frozen=True)
@@ -223,9 +223,12 @@ def _expected(f: Fit, guess: Guess | None) -> bool:
     return guess is not None and borne_out(f.curve(100), guess)
 
 
-def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, guess: Guess | None = None) -> Detection | None:
-    """The device near where it was, (N, 3) m; None where it is not there. Where it may be another line, the whole images must be searched, too: `sure` tells."""
-    found = _fit_from(sheet, radius, min_length_px, points, guess, EXTENSION_PX)
+def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, coarse: int | None = 1, guess: Guess | None = None) -> Detection | None:
+    """The device near where it was or should be by now, (N, 3) m; None where it is not there. `coarse`: see fit.
+
+    Where it may be another line, the whole images must be searched, too: `sure` tells.
+    """
+    found = _fit_from(sheet, radius, min_length_px, points, coarse, guess, EXTENSION_PX)
     if found is None:
         return None
     ends, before = found.fit.curve(2), points[[0, -1]]
@@ -233,9 +236,9 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
     return replace(found, sure=found.sure and not jumped)
 
 
-def _fit_from(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, guess: Guess | None, beyond_px: float) -> Detection | None:
+def _fit_from(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, coarse: int | None, guess: Guess | None, beyond_px: float) -> Detection | None:
     """A fit that starts at (N, 3) m and may be believed; whether it is `sure`."""
-    fitted = fit(sheet, points, radius, 1, beyond_px)
+    fitted = fit(sheet, points, radius, coarse, beyond_px)
     if fitted is None or blunt(fitted).any() or (fitted.alone >= 0).any():
         return None
     expected = _expected(fitted, guess)
@@ -253,7 +256,7 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     start = follow(sheet, guess, radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = _fit_from(sheet, radius, min_length_px, start, guess, LOOKED_PX)
+    found = _fit_from(sheet, radius, min_length_px, start, 1, guess, LOOKED_PX)
     if found is None or not _expected(found.fit, guess):
         return None
     f = found.fit

@@ -25,6 +25,7 @@ COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 LONGEST_PX = 16000      # OpenCV samples 32767 rows at once: the strips of both planes
 COARSE_STEP = 3         # px between the strips of a coarse round
+ASTRAY_PX = 1.0         # strips whose device lies farther off do not tell how far
 SETTLED_PX = 0.1        # a fine round that moves the curve less is the last: strips tell offsets so small exactly
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked at once
@@ -73,10 +74,10 @@ class Fit:
         return self.spline(np.linspace(self.start, self.stop, count))
 
 
-def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int = COARSE, beyond_px: float = EXTENSION_PX, clearing: bool = False) -> Fit | None:
+def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = COARSE, beyond_px: float = EXTENSION_PX, clearing: bool = False) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
-    radius: of the device, m. coarse: rounds that search for it a few px around. beyond_px: how far past both ends is looked at once.
+    radius: of the device, m. coarse: rounds that search for it a few px around; None: no Fit where it is not within ASTRAY_PX. beyond_px: how far past both ends is looked at once.
     clearing: take the line beside the device away, if there is one; slower.
     """
     views = sheet.views
@@ -142,7 +143,7 @@ class _Pair:
         template = _shadows(half_width, offsets)
         return cls(sheet, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template], half_width if clearing else None)
 
-    def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int, fine: int, near: bool = False) -> _Seen | None:
+    def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int | None, fine: int, near: bool = False) -> _Seen | None:
         """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is none."""
         views = self.sheet.views
         if not spline.stop - spline.start < self.step * min(LONGEST_PX, sum(v.width + v.height for v in views)):
@@ -150,10 +151,10 @@ class _Pair:
         cut_here = lambda layout: self.cut(layout.basis @ spline.control, layout.slope @ spline.control)     # noqa: E731
         layout = Layout.of(spline, COARSE_STEP * self.step)
         within = (layout.s >= reference[0]) & (layout.s <= reference[1])
-        for _ in range(coarse):
+        for _ in range(coarse or 0):
             strips = cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + WIDE_PX, rough=True)
             spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within, near=near).spline
-        if not coarse:
+        if coarse == 0:
             strips = cut_here(layout)
             measured = measure(strips, self.cylinder, within)
             spline = solve(layout, spline, strips, measured, views, within).spline
@@ -161,7 +162,7 @@ class _Pair:
             if stretch is not None:
                 reference = (layout.s[stretch[0]], layout.s[stretch[1]])
         layout = Layout.of(spline, self.step)
-        for _ in range(fine):
+        for k in range(fine):
             strips = cut_here(layout)
             within = (layout.s >= reference[0]) & (layout.s <= reference[1])
             own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, self.beside, strips.inside, self.template)])
@@ -169,7 +170,7 @@ class _Pair:
             measured = measure(strips, model, within)
             solution = solve(layout, spline, strips, measured, views, within)
             stretch = supported(measured.presence.T)
-            if stretch is None:
+            if stretch is None or (coarse is None and k == 0 and solution.moved_px > ASTRAY_PX):
                 return None
             seen = _Seen(layout, solution, strips, measured, within, model, stretch)
             spline, before, reference = solution.spline, reference, seen.reference

@@ -19,6 +19,7 @@ from .fit import Fit
 from .follow import reach_px
 from .geometry import GeometryError, calibration_covariance, check, crop, distort, pixels_per_metre, project, undistort
 from .mask import subtract
+from .motion import going_on
 from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .planes import both
 from .prior import Guess, borne_out, informed, judged, look
@@ -53,8 +54,11 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     radius, polarity = config.detection.robot_radius, config.detection.polarity
     near = []       # what is found near where it was, or should be
     if config.curve.tracking and prior.previous is not None:
-        around = [region_around(v, prior.previous.points) for v in frame.views]
-        near += _near(around, track, images, fields, frame.views, polarity, radius, config.detection.min_length_px, prior.previous.points, guess)
+        expected = going_on(prior, frame.stamp_ns)
+        for points, coarse in ((expected, None), (prior.previous.points, 1)):
+            if points is not None and not near:
+                around = [region_around(v, points) for v in frame.views]
+                near += _near(around, track, images, fields, frame.views, polarity, radius, config.detection.min_length_px, points, coarse, guess)
         clock.lap('track')
     if guess is not None and not any(d.sure and borne_out(d.fit.curve(100), guess) for d in near):
         around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -133,7 +134,7 @@ class Memory:
 
     def __init__(self):
         self._lock = threading.Lock()
-        self._previous: tuple[Shape, int, str] | None = None    # shape, stamp, frame
+        self._last: deque[tuple[Shape, int, str]] = deque(maxlen=2)     # shape, stamp, frame
         self._sums, self._taken, self._wanted = None, 0, 0
         self._masks, self._window = None, None      # what was captured, and the images it fits
         self.generation = 0     # a result that was begun in an earlier one is out of date
@@ -143,7 +144,7 @@ class Memory:
         """Forget the last shape; results under way are out of date."""
         with self._lock:
             self.generation += 1
-            self._previous = None
+            self._last.clear()
 
     def capture_mask(self, pairs: int) -> None:
         """The next `pairs` pairs become the mask."""
@@ -196,11 +197,10 @@ class Memory:
         with self._lock:
             if self._masks is not None and window != self._window:
                 self._masks, self.note = None, 'mask cleared: the size or region of the images changed'
-            previous, stamp_ns, frame_id = self._previous or (None, None, None)
-            if not job.config.curve.tracking or frame_id != frame.frame_id:
-                previous, stamp_ns = None, None
+            known = [(shape, stamp_ns) for shape, stamp_ns, frame_id in self._last if job.config.curve.tracking and frame_id == frame.frame_id]
+            before, previous = [(None, None)] * (2 - len(known)) + known
             points, fault = _predicted(job, frame)
-            return Prior(previous, stamp_ns, self._masks, points, fault)
+            return Prior(*previous, *before, self._masks, points, fault)
 
     def remember(self, job: Job, frame: Frame, result: Reconstruction) -> bool:
         """Keep the shape of a result for the next pair; False where the result is out of date and must not be published."""
@@ -208,7 +208,7 @@ class Memory:
             if job.generation != self.generation:
                 return False
             if result.shape is not None:
-                self._previous = result.shape, frame.stamp_ns, frame.frame_id
+                self._last.append((result.shape, frame.stamp_ns, frame.frame_id))
             return True
 
 

@@ -286,7 +286,7 @@ def test_growth_is_of_the_cost_per_pixel_in_yardsticks():
 
 def test_what_is_wrong_is_not_timed(monkeypatch, capsys):
     monkeypatch.setattr(speed, 'reconstruct', lambda frame, *_: Reconstruction(Outcome.NO_DEVICE_A))
-    monkeypatch.setattr(speed, 'sequences', lambda *_: [(case().scene,) * 2])
+    monkeypatch.setattr(speed, 'sequences', lambda *_: [(case().scene,) * 3])
     found = speed.measure(320, 1, 1, 0, compared=0)
     assert [(laps.scenes, laps.right, laps.seconds) for laps in found] == [(1, 0, [])] * 2
     assert 'nan' in speed.table(found + [speed.Laps(320, speed.PAPER, 1, 0, [1.0], [0.1], [1.0])])

@@ -29,8 +29,9 @@ CONFIG = Config.from_values(base_position=run().backbone()[0].tolist())
 
 
 def pictures(shapes):
-    """Scenes of the run's device in these shapes, each with noise of its own."""
-    return [replace(run(), shape=shape).scene(index=k) for k, shape in enumerate(shapes)]
+    """Scenes of the run's device in these shapes, each with noise of its own, 15 a second."""
+    scenes = [replace(run(), shape=shape).scene(index=k) for k, shape in enumerate(shapes)]
+    return [replace(scene, frame=replace(scene.frame, stamp_ns=10**9 + k * 10**9 // 15)) for k, scene in enumerate(scenes)]
 
 
 def moved(x, y=0.0, z=0.0):
@@ -44,11 +45,13 @@ def search(scene):
 
 
 def follow(scenes, previous=None):
-    """The answers, each beginning from the last shape."""
-    answers = []
+    """The answers, each beginning from the last two shapes."""
+    answers, known = [], [(previous, None)]
     for scene in scenes:
-        answers.append(reconstruct(scene.frame, CONFIG, Prior(previous=previous)))
-        previous = answers[-1].shape or previous
+        last, before = known[-1], known[-2] if len(known) > 2 else (None, None)
+        answers.append(reconstruct(scene.frame, CONFIG, Prior(*last, *before)))
+        if answers[-1].shape is not None:
+            known.append((answers[-1].shape, scene.frame.stamp_ns))
     return answers
 
 

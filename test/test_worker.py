@@ -1,6 +1,7 @@
 """Messages into a Frame, what the node remembers, and the thread that takes the newest pair. No ROS."""
 
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -122,6 +123,17 @@ def test_the_last_shape_is_remembered_until_reset():
     assert recall(memory, reference_frame='cell').previous is None      # its numbers mean something else there
     memory.reset()
     assert recall(memory).previous is None
+
+
+def test_the_shape_before_the_last_is_remembered_too():
+    memory = Memory()
+    after_good(memory)
+    assert recall(memory).before is None
+    later = replace(GOOD, shape=replace(SHAPE, points=SHAPE.points + 1))
+    the_job = job(generation=memory.generation)
+    memory.remember(the_job, replace(adapt(the_job, view_of, no_lookup, Tally()), stamp_ns=9), later)
+    prior = recall(memory)
+    assert (prior.previous, prior.previous_stamp_ns, prior.before, prior.before_stamp_ns) == (later.shape, 9, SHAPE, 5)
 
 
 def test_a_result_begun_before_a_reset_is_out_of_date():

@@ -29,7 +29,8 @@ from .trial import WITHIN_MEAN, WITHIN_TIP
 
 FIELD = 0.3e-3 * 1024               # m at the isocentre, whatever the number of pixels
 PHOTONS = 1500.0 * 1024**2          # of the whole field
-MOMENT, STEP = 1.0, 1 / 30          # s: when the moving device is seen, and how long before that its previous pair was taken
+MOMENT, STEP = 1.0, 1 / 30          # s: when the moving device is seen, and how long before that the pair before was taken, and the one before that
+STEP_NS = round(STEP * 1e9)
 COMPARED = 2                        # scenes for what takes seconds
 SPLINE, TRACKED, PAPER, FRANGI = 'spline, full', 'spline, tracked', 'paper', 'skimage frangi'
 
@@ -97,12 +98,12 @@ def is_right(result: Reconstruction, scene: Scene) -> bool:
     return errors.mean <= WITHIN_MEAN and errors.tip <= WITHIN_TIP
 
 
-def sequences(size: int, count: int, seed: int) -> list[tuple[Scene, Scene]]:
-    """Two successive moments of `count` devices that move in front of anatomies, `size` x `size` px each."""
+def sequences(size: int, count: int, seed: int) -> list[tuple[Scene, Scene, Scene]]:
+    """Three successive moments of `count` devices that move in front of anatomies, `size` x `size` px each."""
     views = biplane(arm=CArm(pixel_size_iso=FIELD / size, width=size, height=size))
     exposure = Exposure(photons=PHOTONS / size**2)
     runs = (xray_run(seed + k, views=views, exposure=exposure) for k in range(count))
-    return [(run.scene(MOMENT - STEP, 0), run.scene(MOMENT, 1)) for run in tqdm(runs, f'{size} px, rendering', count, unit='scene', disable=None, leave=False)]
+    return [tuple(run.scene(MOMENT - k * STEP, 2 - k) for k in (2, 1, 0)) for run in tqdm(runs, f'{size} px, rendering', count, unit='scene', disable=None, leave=False)]
 
 
 def measure(size: int, count: int, rounds: int, seed: int, compared: int = COMPARED) -> list[Laps]:
@@ -113,11 +114,12 @@ def measure(size: int, count: int, rounds: int, seed: int, compared: int = COMPA
     """
     cv2.setNumThreads(Config().input.threads)
     blank = np.random.default_rng(0).random((1024, 1024), np.float32)
-    pairs = sequences(size, count, seed)
+    moments = sequences(size, count, seed)
     full, tracked = Laps(size, SPLINE, count), Laps(size, TRACKED, count)
-    given = {way: [(now, config_of(now), Prior()) for _, now in pairs] for way in (SPLINE, TRACKED)}
-    for k, (before, now) in enumerate(pairs):
-        given[TRACKED][k] = now, config_of(now), Prior(previous=reconstruct(before.frame, config_of(before)).shape)
+    given = {way: [(now, config_of(now), Prior()) for *_, now in moments] for way in (SPLINE, TRACKED)}
+    for k, (*earlier, now) in enumerate(moments):
+        before, last = (reconstruct(scene.frame, config_of(scene)).shape for scene in earlier)
+        given[TRACKED][k] = now, config_of(now), Prior(last, now.frame.stamp_ns - STEP_NS, before, now.frame.stamp_ns - 2 * STEP_NS)
     for laps in (full, tracked):
         given[laps.way] = [(now.frame, config, prior) for now, config, prior in given[laps.way]
                            if (laps is full or prior.previous is not None) and is_right(reconstruct(now.frame, config, prior), now)]
@@ -127,7 +129,7 @@ def measure(size: int, count: int, rounds: int, seed: int, compared: int = COMPA
             for laps, arguments in zip((full, tracked), both):
                 if arguments is not None:
                     laps.add(partial(reconstruct, *arguments), blank)
-    return [full, tracked, *_compared([now for _, now in pairs[:compared]], blank)]
+    return [full, tracked, *_compared([now for *_, now in moments[:compared]], blank)]
 
 
 def _compared(scenes: list[Scene], blank: np.ndarray) -> list[Laps]:
