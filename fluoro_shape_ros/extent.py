@@ -23,8 +23,9 @@ FLOOR_PX = 0.12         # what the model of the edge itself is worth
 
 def supported(presence: np.ndarray, step_px: int = 1) -> tuple[int, int] | None:
     """First and last index of the device's stretch of (N, 2) presence (NaN: outside the field), about `step_px` apart; None where there is none."""
-    smooth = cv2.blur(np.where(np.isfinite(presence), presence.clip(-1, 2), 0).astype(np.float32), (1, SMOOTH_PX // step_px), borderType=cv2.BORDER_REPLICATE)
-    both, either = (smooth > PRESENT).all(axis=1), (smooth > PRESENT).any(axis=1)
+    known = np.where(np.isfinite(presence.T), np.minimum(np.maximum(presence.T, -1), 2), 0).astype(np.float32)      # a row a plane
+    a, b = cv2.blur(known, (SMOOTH_PX // step_px, 1), borderType=cv2.BORDER_REPLICATE) > PRESENT
+    both, either = a & b, a | b
     at = np.nonzero(both)[0]
     if len(at) < 5:
         return None

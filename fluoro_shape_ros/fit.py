@@ -7,7 +7,7 @@ are perpendicular and sub-pixel, no correspondence is needed any more, and the n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -138,10 +138,7 @@ class _Pair:
 
     @classmethod
     def of(cls, sheet: Sheet, half_width, step: float, clearing: bool) -> _Pair:
-        reach = half_width_range(max(half_width))
-        offsets = np.arange(-reach, reach + 1)
-        template = _shadows(half_width, offsets)
-        return cls(sheet, step, reach, template, Model.of(template, offsets), [background(t, offsets) for t in template], half_width if clearing else None)
+        return cls(sheet, step, *_looks(*(round(100 * h) for h in half_width)), half_width if clearing else None)
 
     def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int | None, fine: int, near: bool = False) -> _Seen | None:
         """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is none."""
@@ -234,9 +231,13 @@ def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
     return rows
 
 
-def _shadows(half_width, offsets_px: np.ndarray) -> np.ndarray:
-    """(2, W) what a cylinder's shadow looks like in each plane."""
-    return np.stack([shadow(h, offsets_px) for h in half_width])
+@lru_cache(64)
+def _looks(*half_width_cpx: int) -> tuple[float, np.ndarray, Model, list[np.ndarray]]:
+    """How far strips reach, the shadow of a cylinder of so many hundredths of a px in each plane, and what a _Pair makes of it."""
+    reach = half_width_range(max(half_width_cpx) / 100)
+    offsets = np.arange(-reach, reach + 1)
+    template = np.stack([shadow(h / 100, offsets) for h in half_width_cpx])
+    return reach, template, Model.of(template, offsets), [background(t, offsets) for t in template]
 
 
 def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:

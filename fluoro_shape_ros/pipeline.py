@@ -139,7 +139,8 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     points, tangents = basis @ f.spline.control, slope @ f.spline.control
     n = len(f.spline.control)
     half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
-    covariance = (half.transpose(0, 1, 3, 2) @ basis[:, None, :, None])[..., 0] + _displaced(f, views, points, tangents, at)
+    near, weights = f.spline.weights(at, 0)
+    covariance = np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near]) + _displaced(f, views, points, tangents, at)
     tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
     sigma = f.end_sigma if forward else f.end_sigma[::-1]
     covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]

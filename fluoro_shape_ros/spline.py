@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,6 +56,7 @@ class Spline3:
         return points @ self.control, tangents @ self.control
 
 
+@lru_cache(MAX_CONTROL)
 def bending(n: int) -> np.ndarray:
     """(n - 3, n) third differences of the control points: zero for a curve of constant curvature, as a robot's tubes bend."""
     return np.diff(np.eye(n), 3, axis=0)
