@@ -77,8 +77,8 @@ class Fit:
 def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = COARSE, beyond_px: float = EXTENSION_PX, clearing: bool = False) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
-    radius: of the device, m. coarse: rounds that search for it a few px around; None: no Fit where it is not within ASTRAY_PX. beyond_px: how far past both ends is looked at once.
-    clearing: take the line beside the device away, if there is one; slower.
+    radius: of the device, m. coarse: rounds that search for it a few px around; 0: one that measures where it is instead; None: none, and no Fit where it is
+    not within ASTRAY_PX. beyond_px: how far past both ends is looked at once. clearing: take the line beside the device away, if there is one; slower.
     """
     views = sheet.views
     scale = [pixels_per_metre(v.P, points) for v in views]
@@ -145,22 +145,11 @@ class _Pair:
         views = self.sheet.views
         if not spline.stop - spline.start < self.step * min(LONGEST_PX, sum(v.width + v.height for v in views)):
             return None     # it has left the images, or turns back and forth in them
-        cut_here = lambda layout: self.cut(layout.basis @ spline.control, layout.slope @ spline.control)     # noqa: E731
-        layout = Layout.of(spline, COARSE_STEP * self.step)
-        within = (layout.s >= reference[0]) & (layout.s <= reference[1])
-        for _ in range(coarse or 0):
-            strips = cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + WIDE_PX, rough=True)
-            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within, near=near).spline
-        if coarse == 0:
-            strips = cut_here(layout)
-            measured = measure(strips, self.cylinder, within)
-            spline = solve(layout, spline, strips, measured, views, within).spline
-            stretch = supported(measured.presence.T, COARSE_STEP)
-            if stretch is not None:
-                reference = (layout.s[stretch[0]], layout.s[stretch[1]])
+        if coarse is not None:
+            spline, reference = self._approach(spline, reference, coarse, near)
         layout = Layout.of(spline, self.step)
         for k in range(fine):
-            strips = cut_here(layout)
+            strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
             within = (layout.s >= reference[0]) & (layout.s <= reference[1])
             own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, self.beside, strips.inside, self.template)])
             model = Model.of(own, strips.offsets_px)
@@ -174,6 +163,22 @@ class _Pair:
             if solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, before)).max() < 2 * self.step:
                 break
         return seen
+
+    def _approach(self, spline: Spline3, reference: tuple[float, float], coarse: int, near: bool) -> tuple[Spline3, tuple[float, float]]:
+        """The curve brought nearer to the device by so many rounds that search, or by one that measures, and between which arc lengths that lies, m."""
+        views, layout = self.sheet.views, Layout.of(spline, COARSE_STEP * self.step)
+        within = (layout.s >= reference[0]) & (layout.s <= reference[1])
+        for _ in range(coarse):
+            strips = cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + WIDE_PX, rough=True)
+            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within, near=near).spline
+        if coarse:
+            return spline, reference
+        strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
+        measured = measure(strips, self.cylinder, within)
+        stretch = supported(measured.presence.T, COARSE_STEP)
+        if stretch is not None:
+            reference = (layout.s[stretch[0]], layout.s[stretch[1]])
+        return solve(layout, spline, strips, measured, views, within).spline, reference
 
     def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
         """The curve prolonged as long as that finds more of the device, straight on or beside it; and (2, 2) what then is aside, see `aside`."""

@@ -85,6 +85,15 @@ def test_tracking_answers_as_a_search_does_and_needs_none(motion):
         assert 'track' in answer.stage_seconds and 'detect' not in answer.stage_seconds
 
 
+def test_a_device_faster_than_any_search_around_it_is_expected_where_it_will_be():
+    *_, now = scenes = pictures([moved(0.0055 * k) for k in range(3)])
+    first, second = (search(scene).shape for scene in scenes[:2])
+    known = dict(previous=second, previous_stamp_ns=scenes[1].frame.stamp_ns)
+    assert 'detect' in reconstruct(now.frame, CONFIG, Prior(**known)).stage_seconds
+    answer = reconstruct(now.frame, CONFIG, Prior(**known, before=first, before_stamp_ns=scenes[0].frame.stamp_ns))
+    assert 'detect' not in answer.stage_seconds and is_right(answer, now) and same(answer.shape, search(now).shape)
+
+
 def test_a_tip_that_swings_while_most_of_the_device_stays_is_followed():
     entering = xray_run(7, views=VIEWS, lengths=(0.10, 0.12), entering=True)
     scenes = [replace(entering, shape=posed(entering.shape, 0.0, 0.5 * k)).scene(index=k) for k in range(4)]     # the tip by 3.7 mm a pair
