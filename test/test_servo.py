@@ -144,6 +144,16 @@ def test_a_blackout_is_measured_from_when_the_robot_must_stand_still():
     assert back == 2                        # the eighth pair was not measured, the ninth was
 
 
+def test_the_referee_hears_from_diagnostics_when_the_node_has_its_mask():
+    from fluoro_shape_ros.tools.servo_referee import Referee
+    from msg_adapters.diagnostics import ReconstructionSummary, diagnostic_array, reconstruction_status
+    from msg_adapters.messages import ros_message
+    referee = Referee()
+    for mask, masked in (('none', False), ('capturing, 7 of 8 pairs', False), ('in use, mean of 8 pairs', True)):
+        referee._on_diagnostics(diagnostic_array([reconstruction_status(ReconstructionSummary(mask=mask))], 1, 'fluoro_shape', ros_message))
+        assert referee.masked == masked
+
+
 def test_the_picture_is_drawn(tmp_path):
     pytest.importorskip('matplotlib')
     import cv2
@@ -175,7 +185,7 @@ def test_the_example_in_the_documentation_is_the_one_that_runs():
 def test_a_run(tmp_path):
     """One target, small images; a machine that is too slow slows the robot's clock down, too."""
     pytest.importorskip('matplotlib')
-    arguments = ['--targets', '1', '--square', '0', '--size', '320', '--no-anatomy', '--out', str(tmp_path), '--domain', str(140 + os.getpid() % 10)]     # nobody else's
+    arguments = ['--targets', '1', '--square', '0', '--size', '320', '--out', str(tmp_path), '--domain', str(140 + os.getpid() % 10)]     # nobody else's
     done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.tools.servo_demo', *arguments], capture_output=True, text=True, timeout=240)
     logs = '\n'.join(f'{log.name}: {log.read_text()}' for log in sorted(tmp_path.glob('*.log')))
     assert done.returncode == 0, f'{done.stdout}{done.stderr}{logs}'

@@ -19,6 +19,7 @@ STEP = 5e-4                 # m, of a backbone that is drawn
 MODEL_ERROR = 0.12          # by which a robot bends otherwise than its model
 PUSHED = (0.008, 0.012)     # m, by which tissue pushes the tip aside at the start
 REACHED = 0.1e-3        # m
+MISSED = 3e-3           # m: a target that the model alone gets nearer to shows nothing
 UP = Pose(np.array([0.0, 0.0, -0.05]), np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))      # along z, across both beams
 
 
@@ -79,12 +80,12 @@ def predicted(name: str, q: np.ndarray) -> np.ndarray:
 
 
 def goals(name: str, seed: int, moved: Plant, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """`count` targets (count, 3) in m that both the robot `moved` and its model can reach, and the joint values (count, n) at which the model does."""
+    """`count` targets (count, 3) in m that both the robot `moved` and its model can reach, and the joint values (count, n) at which the model does and `moved` misses."""
     known, rng, found = ROBOTS[name], np.random.default_rng([seed, 9]), []
     while len(found) < count:
         target = moved.backbone(known.start + known.spread * rng.uniform(-1, 1, len(known.start)))[-1]
         q = reaching(known.robot, target, known.start)
-        if np.linalg.norm(known.robot.backbone(q, STEP)[-1] - target) < REACHED:
+        if np.linalg.norm(known.robot.backbone(q, STEP)[-1] - target) < REACHED and np.linalg.norm(moved.backbone(q)[-1] - target) > MISSED:
             found.append((target, q))
     return tuple(map(np.stack, zip(*found)))
 

@@ -25,8 +25,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         'fluoro_shape_servo_demo', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         description='Close the loop: a robot that bends otherwise than its model and is pushed by tissue, two X-ray streams, the node, and a controller '
-                    'that sees only `tip` drive the tip along a square and to targets, four processes on real topics. Prints the errors of the '
-                    'true tip, the delay of the loop, and by how much the robot misses the targets without it.')
+                    'that sees only `tip` drive the tip along a square and to targets, four processes on real topics. A mask is captured before the '
+                    'robot comes into the field. Prints the errors of the true tip, the delay of the loop, and by how much the robot misses the targets without it.')
     add = parser.add_argument
     add('--robot', choices=tuple(ROBOTS), default='two_tubes', help='concentric tubes, or a segment bent by tendons')
     add('--runs', type=cli.count, default=1, metavar='N', help='each with a robot, a load and targets of its own')
@@ -37,6 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--rate', type=_rate, default=15.0, metavar='HZ', help='pairs a second')
     add('--size', type=cli.count, default=512, metavar='PX', help='of the images, which always show 154 mm')
     add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine')
+    add('--no-mask', action='store_true', help='no mask is captured before the robot comes into the field')
     add('--out', type=Path, default=Path('fluoro_shape_servo_demo'), metavar='FOLDER', help='the picture and logs go there')
     add('--domain', type=int, default=48, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     return parser

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -39,19 +40,33 @@ class Referee(OwnNode):
 
     def __init__(self):
         self.record, self.now = Record(), None
+        self.masked = False     # whether the node says that it uses a mask
         self.target: np.ndarray | None = None
         self._left: dict[int, float] = {}       # when the truth of a pair was heard, just before its images
 
     def _connect(self) -> None:
         self._targets = self._node.create_publisher(PointStamped, 'target', 1)
-        self._blackout = self._node.create_client(Trigger, 'blackout')
+        self._services = {name: self._node.create_client(Trigger, name) for name in ('fluoro_shape/capture_mask', 'insert', 'blackout')}
         for kind, topic, callback in ((PointStamped, 'ground_truth/tip', self._on_truth), (PointStamped, 'tip', self._on_tip),
-                                      (JointState, 'joint_states', self._on_joints), (JointState, 'joint_command', self._on_command)):
+                                      (JointState, 'joint_states', self._on_joints), (JointState, 'joint_command', self._on_command),
+                                      (DiagnosticArray, '/diagnostics', self._on_diagnostics)):
             self._node.create_subscription(kind, topic, callback, 10)
+
+    def ready(self) -> bool:
+        """Whether all that is asked of node and robot can be."""
+        return all(client.service_is_ready() for client in self._services.values())
+
+    def capture_mask(self) -> None:
+        """Ask the node for a mask; `masked` tells when it has one."""
+        self._services['fluoro_shape/capture_mask'].call_async(Trigger.Request())
+
+    def insert(self) -> None:
+        """Ask the robot to come into the field."""
+        self._services['insert'].call_async(Trigger.Request())
 
     def black_out(self) -> None:
         """Ask the robot for a blackout; `record.blackout` says when, once it has answered."""
-        self._blackout.call_async(Trigger.Request()).add_done_callback(
+        self._services['blackout'].call_async(Trigger.Request()).add_done_callback(
             lambda done: setattr(self.record, 'blackout', tuple(map(int, done.result().message.split()))))
 
     def _on_truth(self, msg: PointStamped) -> None:
@@ -63,6 +78,9 @@ class Referee(OwnNode):
             out = PointStamped(header=header(ros_message, self.now, FRAME_ID))
             out.point.x, out.point.y, out.point.z = self.target.tolist()
             self._targets.publish(out)
+
+    def _on_diagnostics(self, msg: DiagnosticArray) -> None:
+        self.masked |= any(value.key == 'mask' and value.value.startswith('in use') for status in msg.status for value in status.values)
 
     def _on_tip(self, msg: PointStamped) -> None:
         self.record.measured[stamp_ns(msg)] = _point(msg)

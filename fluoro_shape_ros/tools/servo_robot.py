@@ -17,6 +17,7 @@ from visualization_msgs.msg import MarkerArray
 from msg_adapters.messages import header, ros_message, stamp_ns
 from msg_adapters.shapes import shape_to_path
 
+from ..data import Frame
 from ..sim import plant
 from ..sim.kinematics import driven
 from ..sim.publisher import FluoroSim, true_shape, use_large_image_profile
@@ -34,8 +35,8 @@ class Robot(OwnNode):
     """Joints and X-ray system with a clock of their own, as a context manager.
 
     The clock goes on by a pair time a pair: as fast as the wall's, but no pair goes out before the one before the last has been answered. So a
-    machine that is too slow slows the robot down, and does not decide how well it is controlled. The service `blackout` takes the device from
-    a plane for BLACKOUT_S; its message are the stamps (ns) between which.
+    machine that is too slow slows the robot down, and does not decide how well it is controlled. At first it is not in the field, until the service
+    `insert` is called. The service `blackout` takes the device from a plane for BLACKOUT_S; its message are the stamps (ns) between which.
     """
 
     NAME = 'servo_robot'
@@ -44,6 +45,7 @@ class Robot(OwnNode):
         self._name, self._period, self._plant = name, 1 / rate, what
         self._joints = self._command = plant.ROBOTS[name].start
         self._index, self._answered, self._stamps, self._dark = 0, 0, [time.time_ns()], (0, 0)
+        self._inserted = False
 
     def _connect(self) -> None:
         self._states = self._node.create_publisher(JointState, 'joint_states', 10)
@@ -51,6 +53,7 @@ class Robot(OwnNode):
         self._node.create_subscription(JointState, 'joint_command', self._on_command, 1)
         self._node.create_subscription(MarkerArray, 'markers', self._on_markers, 10)     # they come for every pair, rejected or not
         self._node.create_service(Trigger, 'blackout', self._on_blackout)
+        self._node.create_service(Trigger, 'insert', self._on_insert)
 
     def run(self, xray: FluoroSim, stop: threading.Event) -> None:
         """Publish joints, prediction and a pair again and again until `stop` is set."""
@@ -67,18 +70,22 @@ class Robot(OwnNode):
         now = self._stamps[-1]
         names = [joint.name for joint in plant.ROBOTS[self._name].robot.joints]
         self._states.publish(JointState(header=header(ros_message, now, ''), name=names, position=self._joints.tolist()))
-        model = true_shape(plant.predicted(self._name, self._joints))
-        self._predictions.publish(shape_to_path(model, now, FRAME_ID, ros_message))
+        if self._inserted:
+            model = true_shape(plant.predicted(self._name, self._joints))
+            self._predictions.publish(shape_to_path(model, now, FRAME_ID, ros_message))
         xray.publish(self._scene(now), now)
 
-    def _scene(self, now: int) -> Scene:
+    def _scene(self, now: int) -> Scene | Frame:
+        if not self._inserted:
+            return self._plant.run.without_device(self._index)
         scene = self._plant.scene(self._joints, self._index, now)
         return plant.without_device(self._plant, self._index, scene, BLIND) if self._dark[0] <= now < self._dark[1] else scene
 
     def _serve(self, due: float, stop: threading.Event) -> None:
         """Take commands until the next pair is due and the one before the last answered, the latter for at most PATIENCE_S."""
         late = time.monotonic() + PATIENCE_S
-        while not stop.is_set() and ((now := time.monotonic()) < due or (self._answered < self._stamps[-2:][0] and now < late)):
+        waiting = lambda: self._inserted and self._answered < self._stamps[-2:][0]      # noqa: E731
+        while not stop.is_set() and ((now := time.monotonic()) < due or (waiting() and now < late)):
             self._executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.01)) or 0.005)
 
     def _on_command(self, msg: JointState) -> None:
@@ -87,6 +94,10 @@ class Robot(OwnNode):
 
     def _on_markers(self, msg: MarkerArray) -> None:
         self._answered = max(self._answered, stamp_ns(msg.markers[0]))
+
+    def _on_insert(self, request, response):
+        self._inserted = response.success = True
+        return response
 
     def _on_blackout(self, request, response):
         start = self._stamps[-1] + round(self._period * 1e9)

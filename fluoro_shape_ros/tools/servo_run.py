@@ -79,6 +79,11 @@ def run(args, seed: int) -> Run:
     with contextlib.ExitStack() as stack:
         children = {name: stack.enter_context(child(arguments, args.out / f'{name}.log')) for name, arguments in commands(args, seed).items()}
         course = Course(stack.enter_context(Referee()), children, args.out)
+        course.until(course.referee.ready)
+        if not args.no_mask:
+            course.referee.capture_mask()
+            course.until(lambda: course.referee.masked)
+        course.referee.insert()
         course.until(lambda: course.record.measured and course.referee.now)
         ends, square = [], None
         if args.square:
