@@ -103,9 +103,10 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
     widths = [radius * pixels_per_metre(v.P, center) for v in views]
     candidates = [candidates_of(*plane, min_length_px) for plane in zip(sheet.planes, sheet.fields, widths)]
     best = tuple(c[0].points_px if c else None for c in candidates)
-    for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
-        if not found:
-            return Detection(None, outcome, f'no line of at least {min_length_px:g} px stands out', best)
+    missing = next(((outcome, f'no line of at least {min_length_px:g} px stands out')
+                    for found, outcome in zip(candidates, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)) if not found), None)
+    if missing and guess is None:
+        return Detection(None, *missing, best)
 
     def attempt_of(fitted: Fit, lines: Lines, start: np.ndarray) -> Attempt:
         share = min((explained(fitted, v, undistort(v, c.points_px), c.z > 0) for v, c in zip(views, lines) if c is not None), default=UNASKED)
@@ -135,11 +136,11 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
     chosen = max(tried, key=lambda t: t.weight, default=None)
     if chosen is None or not chosen.believed:
         path = None if guess is None else follow(sheet, guess, radius, clear=False)
-        if chosen is None and path is None:
-            return Detection(None, Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})', best)
-        chosen = _second_look(partial(attempts, times=2, clearing=True), sheet, radius, candidates, widths, tried, path) or chosen
+        if chosen is not None or path is not None:
+            chosen = _second_look(partial(attempts, times=2, clearing=True), sheet, radius, candidates, widths, tried, path) or chosen
     if chosen is None:
-        return Detection(None, Outcome.NO_CORRESPONDENCE, 'no line of plane a is one of plane b, and what is seen near the prediction is no device', best)
+        none = Outcome.NO_CORRESPONDENCE, f'no line of plane a ({len(candidates[0])}) is one of plane b ({len(candidates[1])})'
+        return Detection(None, *(missing or none), best)
     others = [t for t in tried if any(chosen.lines) and t.lines == chosen.lines and t.plain > RIVAL * chosen.plain and _apart(t.fit, chosen.fit) > APART]
     if others:      # lines along epipolar lines: only the ends tell which way round they belong together
         chosen, second, *_ = sorted([chosen, *others], key=lambda t: t.fit.end_sigma.max())
@@ -153,6 +154,8 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
 
 def _pairs(views, candidates) -> Iterator[Start]:
     """Where the device may be by a line of each plane, most likely first; the same lines in the other direction only where that fits about as well."""
+    if not all(candidates):
+        return
     curves = [[undistort(v, c.points_px) for c in found] for v, found in zip(views, candidates)]
     F = fundamental(views[0].P, views[1].P)
     scores = {}

@@ -17,8 +17,8 @@ from .extent import BLURS_PX, End, bulge, locate, supported
 from .geometry import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from .spline import Spline3, prolong, through
-from .profiles import (OPAQUE, WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces,
-                       shadow, straight_on)
+from .profiles import (OPAQUE, PIECE, WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow,
+                       pieces, shadow, straight_on)
 from .strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
@@ -35,6 +35,7 @@ END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an 
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
 ROUND = 0.99            # likeness of an opaque line that is a device, whatever its width
+MEDIAN = np.sqrt(np.pi / 2 / PIECE)     # standard deviation of the median of a piece's samples, as a share of theirs
 END_PX = 24             # of the device, that must show it
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther ...
@@ -263,7 +264,7 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
     scale = np.array(half_width) / radius
     across = straight_on(contrast, middle(strips.speed[:, between]) / scale)
     parts = [pieces(np.column_stack([p, v]), between & i)[0] for p, v, i in zip(strips.profiles, strips.speed, strips.inside)]
-    each = [likeness(p[:, :-1], h) for p, h in zip(parts, half_width)]
+    each = [likeness(p[:, :-1], h, MEDIAN * n) for p, h, n in zip(parts, half_width, seen.noise)]
     width, alike = apparent_width(each)
     weakest = np.array([best_of_worst(a[:, WIDTHS == width].ravel()) for a in each])
     opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line

@@ -19,14 +19,16 @@ WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
 WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
 
 
-def likeness(profiles: np.ndarray, half_width_px: float) -> np.ndarray:
+def likeness(profiles: np.ndarray, half_width_px: float, noise: float = 0.0) -> np.ndarray:
     """(..., K) correlation of (..., W) profiles, one sample a px about their middles, with the shadows of cylinders WIDTHS times as wide.
 
-    A smooth background (parabola) is taken off both.
+    A smooth background (parabola) is taken off both. noise: standard deviation of a sample; what it takes from the correlation is given back (Spearman
+    1904, for attenuation), unless it is most of the profile.
     """
     basis, shadows = _cylinders(round(100 * half_width_px), profiles.shape[-1])
     a = profiles @ basis @ basis.T - profiles
-    return a @ shadows.T / (np.linalg.norm(a, axis=-1, keepdims=True) + 1e-12)
+    total = np.einsum('...w,...w->...', a, a)[..., None]
+    return np.minimum(a @ shadows.T / np.sqrt(np.maximum(total - (profiles.shape[-1] - 3) * noise**2, 0.5 * total) + 1e-24), 1.0)
 
 
 @lru_cache(256)

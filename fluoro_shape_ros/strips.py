@@ -47,6 +47,7 @@ class Measurement:
     variance: np.ndarray        # (V, N) of it, px^2
     presence: np.ndarray        # (V, N) 1: as dark as the device usually is, 0: nothing there
     presence_sigma: np.ndarray  # (V,) standard deviation of `presence` from noise
+    noise: np.ndarray           # (V,) standard deviation of a sample
 
 
 def half_width_range(half_width_px: float) -> float:
@@ -211,7 +212,7 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     variance[~inside | odd | np.isnan(variance)] = np.inf
     sigma = np.array([n * g / middle(u) if np.isfinite(u[0]) else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
     offset[np.isnan(offset)] = 0.0
-    return Measurement(offset, variance, darkness / usual, sigma)
+    return Measurement(offset, variance, darkness / usual, sigma, noise[:, 0])
 
 
 def darkness_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
@@ -234,7 +235,8 @@ def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     usual = [max(float(middle(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)]
     strength = darkest / np.array(usual)[:, None]
     believed = strips.inside & (strength > 0.4) & (strength < 2.5)
-    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5), np.where(believed, FOUND_PX**2, np.inf), strength, np.ones(len(strength)))
+    unknown = np.ones(len(strength))
+    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5), np.where(believed, FOUND_PX**2, np.inf), strength, unknown, unknown)
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:

@@ -18,7 +18,8 @@ from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
 from fluoro_shape_ros.tools import bench_prior
 from fluoro_shape_ros.tools.bench_prior import Try, predictions, pushed
-from fluoro_shape_ros.tools.trial import Answer
+from fluoro_shape_ros.tools.families import families
+from fluoro_shape_ros.tools.trial import Answer, answer_of
 
 SECOND = 10**9
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
@@ -201,6 +202,19 @@ def test_without_a_device_nothing_is_found_where_it_is_predicted(config, good):
     blank = xray_run(0, views=VIEWS, lengths=(0.07, 0.08), anatomy=False).without_device()
     result = reconstruct(blank, config, Prior(predicted=good))
     assert result.outcome is Outcome.NO_DEVICE_A and result.prediction == 'not compared'
+
+
+def test_too_faint_to_be_found_in_an_image_it_is_found_where_it_is_predicted():
+    case = families()['faint'].make(20002)
+    config = Config.from_values(base_position=case.scene.base_position.tolist())
+    given = predictions(case.scene.truth, case.scene.seed)
+    without = reconstruct(case.scene.frame, config)
+    assert without.outcome is Outcome.NO_DEVICE_A
+    found = answer_of(case, reconstruct(case.scene.frame, config, Prior(predicted=given['good'])))
+    assert found.within and found.errors.tip < 0.7e-3
+    for kind in ('shifted', 'reversed', 'another'):
+        wrong = reconstruct(case.scene.frame, config, Prior(predicted=given[kind]))
+        assert wrong.outcome is without.outcome and wrong.prediction == 'not compared'
 
 
 def test_the_published_method_takes_only_the_order(scene, good):

@@ -197,6 +197,20 @@ def test_likeness_knows_the_devices_width(half_width, low, high):
     assert low < alike(strips) <= high
 
 
+def test_likeness_does_not_mind_noise_that_is_known():
+    """A shadow with as much noise as it has of its own is like one by 1 / sqrt(2) to the eye."""
+    offsets = np.arange(-10.0, 11.0)
+    parabolas = np.vander(offsets, 3)
+    clean = shadow(HALF_WIDTH, offsets) - parabolas @ np.linalg.lstsq(parabolas, shadow(HALF_WIDTH, offsets))[0]
+    sigma = np.linalg.norm(clean) / np.sqrt(len(offsets) - 3)
+    noisy = -shadow(HALF_WIDTH, offsets) + np.random.default_rng(0).normal(0, sigma, (4000, len(offsets)))
+    own = np.abs(WIDTHS - 1).argmin()
+    assert np.median(likeness(noisy, HALF_WIDTH)[:, own]) == pytest.approx(np.sqrt(0.5), abs=0.03)
+    assert np.median(likeness(noisy, HALF_WIDTH, sigma)[:, own]) > 0.95
+    assert likeness(noisy, HALF_WIDTH, 10 * sigma).max() <= 1       # more noise than there can be
+    assert np.median(np.abs(likeness(noisy + shadow(HALF_WIDTH, offsets), HALF_WIDTH, sigma)[:, own])) < 0.5     # what is nothing but noise stays so
+
+
 def test_a_bright_line_is_the_opposite_and_an_edge_is_unlike():
     bright = strips_of((1, 0, 0), depth=-30.0)
     assert alike(bright) < -0.95

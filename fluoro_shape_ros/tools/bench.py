@@ -16,7 +16,7 @@ from . import bench_prior, latency, memory, speed
 from .bench_table import plain, rows, table
 from .cli import ToolError, count, natural, need, positive, run
 from .composites import load
-from .families import ACCURACY, ROBUSTNESS, Family, on_real
+from .families import ACCURACY, ROBUSTNESS, Family, families, on_real
 from .latency import moving_scenes
 from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
 
@@ -54,8 +54,8 @@ def _add_speed(commands) -> None:
 
 def _add_prior(commands) -> None:
     prior = commands.add_parser('prior', help='what a predicted_backbone is worth on the first pair, good or wrong')
-    prior.add_argument('--families', nargs='+', metavar='NAME', choices=[*ACCURACY, *ROBUSTNESS], default=list(bench_prior.FAMILIES),
-                       help=f'see accuracy and robustness (default: {" ".join(bench_prior.FAMILIES)})')
+    prior.add_argument('--families', nargs='+', metavar='NAME', choices=list(families()), default=list(bench_prior.FAMILIES),
+                       help=f'see accuracy and robustness; and faint, a fortieth of the dose (default: {" ".join(bench_prior.FAMILIES)})')
     prior.add_argument('--scenes', type=count, default=10, metavar='N', help='scenes of each family (default: 10)')
     prior.add_argument('--rounds', type=count, default=3, metavar='N', help='how often each is timed (default: 3)')
     prior.add_argument('--first-seed', type=natural, default=0, metavar='SEED', help='seeds count up from here (default: 0)')

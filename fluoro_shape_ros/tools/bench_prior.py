@@ -20,7 +20,7 @@ from ..sim.shapes import random_cannula
 from .families import Case, families
 from .trial import Answer, answer_of
 
-FAMILIES = ('low_dose', 'clutter', 'crossing')
+FAMILIES = ('low_dose', 'faint', 'clutter', 'crossing')
 PUSHED = 0.015              # m, by which tissue pushes the tip aside, at most; at least half of it
 SHIFT = 0.050               # m
 SAME = 0.02e-3              # m, between two answers that are the same

@@ -1,7 +1,7 @@
 """Families of seeded scenes with known truth, by name: what the benches report on.
 
 ACCURACY scenes have nothing in them but the device, so that the Cramer-Rao bound applies. ROBUSTNESS scenes are X-ray images over anatomy
-(0.3 mm a pixel, planes 90 degrees apart, 1500 photons a pixel, 25 % contrast), each with one more difficulty.
+(0.3 mm a pixel, planes 90 degrees apart, 1500 photons a pixel, 25 % contrast), each with one more difficulty. HARDER ones show what a prediction is worth.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .composites import composite
 HIDDEN_PX = 25.0                            # of the device, behind the occluder
 CALIBRATION_ERROR_PX = 0.5
 ANGLES = np.deg2rad((35.0, 125.0))          # between the planes
-LOW_DOSE = 150.0                            # photons a pixel
+LOW_DOSE, FAINT = 150.0, 37.5               # photons a pixel
 MASK_FRAMES, MASK_SHIFT_PX = 8, 1.5         # frames averaged; the most that the patient has moved since, along u and v
 SHORT, LONG = (0.067, 0.150), (0.140, 0.188)    # m: fits the field of 0.2 mm/px; room for a loop
 
@@ -48,7 +48,7 @@ class Family:
 
 def families(real: Path | None = None) -> dict[str, Family]:
     """All families by name; those on real backgrounds exist where their folder `real` is given."""
-    return ACCURACY | ROBUSTNESS | (on_real(real) if real else {})
+    return ACCURACY | ROBUSTNESS | HARDER | (on_real(real) if real else {})
 
 
 def on_real(folder: Path) -> dict[str, Family]:
@@ -148,4 +148,7 @@ ROBUSTNESS = {
     'calibration': Family(f'plane B\'s calibration off by {CALIBRATION_ERROR_PX:g} px; else the scenes of anatomy', _miscalibrated),
     'blank': Family('no device', _blank, device=False),
     'one_plane': Family('device in one plane only', _one_plane, device=False),
+}
+HARDER = {
+    'faint': Family('X-ray at 0.3 mm a pixel, a fortieth of the dose', lambda seed: _bare(_xray(seed, anatomy=False, photons=FAINT))),
 }
