@@ -42,6 +42,7 @@ CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypot
 PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
+STRAYED_PX = 8.0        # of a path from the fit that began there: it has lost part of the device, or the path went beyond that
 ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 JUMPED = 4e-3           # m: an end farther from where it was, or should be by now, may have slipped on to another line
 
@@ -247,7 +248,8 @@ def _fit_from(sheet: Sheet, radius: float, min_length_px: float, points: np.ndar
     expected = _expected(fitted, guess)
     if doubt(fitted, min_length_px, expected):
         return None
-    sure = _speaks(fitted, expected) > CONVINCING and fitted.aside.max() < ASIDE and fitted.weakest.min() > MIN_WEAKEST
+    lonely = fitted.aside.max() < ASIDE or (expected and clear(fitted))
+    sure = _speaks(fitted, expected) > CONVINCING and lonely and fitted.weakest.min() > MIN_WEAKEST
     return Detection(fitted, Outcome.OK, 'ok', tuple(_projected(fitted, v) for v in sheet.views), sure=bool(sure))
 
 
@@ -260,11 +262,16 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     if start is None or not borne_out(start, guess):
         return None
     found = _fit_from(sheet, radius, min_length_px, start, 1, guess, LOOKED_PX)
-    if found is None or not _expected(found.fit, guess):
+    if found is None or not _expected(found.fit, guess) or max(_strayed_px(start, found.fit, v) for v in sheet.views) > STRAYED_PX:
         return None
     f = found.fit
     sharp = (f.open_end | (f.end_sigma < SHARP)).all()
     return replace(found, sure=bool(found.sure and sharp and whole(f.stop - f.start, guess, sheet.views)))
+
+
+def _strayed_px(path: np.ndarray, f: Fit, view) -> float:
+    """How far the projected (M, 3) path leaves the projected fit."""
+    return float(cKDTree(project(view.P, f.curve(200))).query(project(view.P, path))[0].max())
 
 
 def candidates_of(image, field, half_width_px: float, min_length_px: float) -> list[Candidate]:

@@ -204,6 +204,14 @@ def test_without_a_device_nothing_is_found_where_it_is_predicted(config, good):
     assert result.outcome is Outcome.NO_DEVICE_A and result.prediction == 'not compared'
 
 
+def test_a_fit_that_loses_the_end_of_its_path_is_not_believed():
+    """Here one step past the device's bend the curve leaves it in both planes at once, which looks like an end, 20 mm short of it."""
+    case = families()['tangent'].make(10035)
+    config = Config.from_values(base_position=case.scene.base_position.tolist())
+    good = predictions(case.scene.truth, case.scene.seed)['good']
+    assert answer_of(case, reconstruct(case.scene.frame, config, Prior(predicted=good))).within
+
+
 def test_too_faint_to_be_found_in_an_image_it_is_found_where_it_is_predicted():
     case = families()['faint'].make(20002)
     config = Config.from_values(base_position=case.scene.base_position.tolist())
