@@ -43,6 +43,7 @@ PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
 STRAYED_PX = 8.0        # of a path from the fit that began there: it has lost part of the device, or the path went beyond that
+RESTLESS_PX = 0.5       # of a fit's last step: it has not come to rest yet, and is fitted once more
 ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 JUMPED = 4e-3           # m: an end farther from where it was, or should be by now, may have slipped on to another line
 
@@ -262,9 +263,13 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     if start is None or not borne_out(start, guess):
         return None
     found = _fit_from(sheet, radius, min_length_px, start, 1, guess, LOOKED_PX)
-    if found is None or not _expected(found.fit, guess) or max(_strayed_px(start, found.fit, v) for v in sheet.views) > STRAYED_PX:
+    if found is not None and found.fit.moved_px > RESTLESS_PX:
+        found = _fit_from(sheet, radius, min_length_px, found.fit.curve(200), 0, guess, LOOKED_PX)
+    if found is None or found.fit.moved_px > RESTLESS_PX or not _expected(found.fit, guess):
         return None
     f = found.fit
+    if max(_strayed_px(start, f, v) for v in sheet.views) > STRAYED_PX:
+        return None
     sharp = (f.open_end | (f.end_sigma < SHARP)).all()
     return replace(found, sure=bool(found.sure and sharp and whole(f.stop - f.start, guess, sheet.views)))
 

@@ -69,6 +69,7 @@ class Fit:
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
     fading: np.ndarray          # (2,) logarithm of how dark both planes show its last stretch at each end, beside the rest of it, see profiles.fading
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
+    moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not come to rest
 
     def curve(self, count: int) -> np.ndarray:
         """(count, 3) m along the device."""
@@ -97,7 +98,10 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
     if agreed:
         strips, measured = look(found, s, seen.within)
         solution = solve(seen.layout, found.spline, strips, measured, views, seen.within, agreed)
+        before = found.curve(2)
         found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, half_width, radius)
+        slid = np.linalg.norm(found.curve(2) - before, axis=1).max() / step      # in depth, which strips do not see
+        found = replace(found, moved_px=max(found.moved_px, float(slid)))
     return _see_ends(look, found, ends, half_width, radius)
 
 
@@ -281,7 +285,7 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
                contrast, across, width, odd, alike, weakest, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
-               np.where(open_end, 0.0, sum(fading(p[:, :-1], p[:, -1] / k) for p, k in zip(parts, scale))), np.full(2, -1)), ends
+               np.where(open_end, 0.0, sum(fading(p[:, :-1], p[:, -1] / k) for p, k in zip(parts, scale))), np.full(2, -1), solution.moved_px), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -19,14 +19,14 @@ from .spline import through
 from .profiles import shadow
 from .strips import Measurement, Sheet, Strips, lay_out
 
-STEP_PX = 4.0           # between strips ...
-SHIFT_PX = 2            # ... and between shifts, so that a path may turn by 27 degrees from the prediction
+STEP_PX = 6.0           # between strips ...
+SHIFT_PX = 3            # ... and between shifts, so that a path may turn by 27 degrees from the prediction
 WITHIN = 2.0            # standard deviations to either side that a strip reaches
 BEYOND_PX = 30.0        # the path goes on straight past both ends: the device may be longer
 STRONGEST = 6.0         # noise deviations: a darker strip speaks no louder, it may be something else
 BEND_COST = 0.7         # of a shift that changes from a strip to the next ...
-TRUST = 0.1             # ... and what the prediction counts in each strip: its error is the same in many
-SMOOTH = 2.0            # strips, over which the path is smoothed
+TRUST = 0.15            # ... and what the prediction counts in each strip: its error is the same in many
+SMOOTH = 1.5            # strips, over which the path is smoothed
 CLEAR = 2.0             # noise deviations: darker strips speak for the device, others against it
 SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try

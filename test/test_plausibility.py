@@ -73,7 +73,7 @@ def device(**other):
                  covariance=np.eye(30) * 1e-10, s=S, presence=present, offset_px=np.zeros((len(S), 2)),
                  contrast=np.array([0.25, 0.25]), across=np.array([0.25, 0.25]), width=0.9, odd_width=0.0,
                  likeness=np.array([0.99, 0.99]), weakest=np.array([0.95, 0.98]), beyond=np.zeros((2, 2)), aside=np.zeros((2, 2)),
-                 fading=np.zeros(2), alone=np.full(2, -1))
+                 fading=np.zeros(2), alone=np.full(2, -1), moved_px=0.0)
     return Fit(**clear | other)
 
 
