@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from .centerline import find_ridges, ridge_scale, shrinking
 from .chains import Candidate, find_candidates
 from .data import Outcome
-from .fit import COARSE, EXTENSION_PX, Fit, fit
+from .fit import COARSE, Fit, fit
 from .follow import follow
 from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
 from .hop import other_lines
@@ -42,7 +42,7 @@ CONVINCING = 0.6        # evidence for a length of 1 m that needs no other hypot
 PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
-STRAYED_PX = 8.0        # of a path from the fit that began there: it has lost part of the device, or the path went beyond that
+STRAYED_PX = 8.0        # of a path from the fit that began there: unless its ends are clear, it has lost part of the device
 RESTLESS_PX = 0.5       # of a fit's last step: it has not come to rest yet, and is fitted once more
 ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 JUMPED = 4e-3           # m: an end farther from where it was, or should be by now, may have slipped on to another line
@@ -233,7 +233,7 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
 
     Where it may be another line, the whole images must be searched, too: `sure` tells.
     """
-    found = _fit_from(sheet, radius, min_length_px, points, coarse, guess, EXTENSION_PX)
+    found = _near(sheet, fit(sheet, points, radius, coarse), min_length_px, guess)
     if found is None:
         return None
     ends, before = found.fit.curve(2), points[[0, -1]]
@@ -241,9 +241,8 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
     return replace(found, sure=found.sure and not jumped)
 
 
-def _fit_from(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray, coarse: int | None, guess: Guess | None, beyond_px: float) -> Detection | None:
-    """A fit that starts at (N, 3) m and may be believed; whether it is `sure`."""
-    fitted = fit(sheet, points, radius, coarse, beyond_px)
+def _near(sheet: Sheet, fitted: Fit | None, min_length_px: float, guess: Guess | None) -> Detection | None:
+    """A fit that no line of the images led to, if it may be believed; whether it is `sure`."""
     if fitted is None or blunt(fitted).any() or (fitted.alone >= 0).any():
         return None
     expected = _expected(fitted, guess)
@@ -262,16 +261,16 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     start = follow(sheet, guess, radius)
     if start is None or not borne_out(start, guess):
         return None
-    found = _fit_from(sheet, radius, min_length_px, start, 1, guess, LOOKED_PX)
-    if found is not None and found.fit.moved_px > RESTLESS_PX:
-        found = _fit_from(sheet, radius, min_length_px, found.fit.curve(200), 0, guess, LOOKED_PX)
-    if found is None or found.fit.moved_px > RESTLESS_PX or not _expected(found.fit, guess):
+    fitted = fit(sheet, start, radius, 1, LOOKED_PX)
+    if fitted is not None and fitted.moved_px > RESTLESS_PX:
+        fitted = fit(sheet, fitted.curve(200), radius, 0, LOOKED_PX)
+    found = _near(sheet, fitted, min_length_px, guess)
+    if found is None or fitted.moved_px > RESTLESS_PX or not _expected(fitted, guess):
         return None
-    f = found.fit
-    if max(_strayed_px(start, f, v) for v in sheet.views) > STRAYED_PX:
+    if not clear(fitted) and max(_strayed_px(start, fitted, v) for v in sheet.views) > STRAYED_PX:
         return None
-    sharp = (f.open_end | (f.end_sigma < SHARP)).all()
-    return replace(found, sure=bool(found.sure and sharp and whole(f.stop - f.start, guess, sheet.views)))
+    sharp = (fitted.open_end | (fitted.end_sigma < SHARP)).all()
+    return replace(found, sure=bool(found.sure and sharp and whole(fitted.stop - fitted.start, guess, sheet.views)))
 
 
 def _strayed_px(path: np.ndarray, f: Fit, view) -> float:
