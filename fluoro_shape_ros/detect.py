@@ -43,7 +43,7 @@ PROMISING = 0.08        # ... and that makes another try worth while
 LOOKED_PX = 48.0        # past both ends of the path that a guess leads to, which often stops short of the device's
 SHARP = 0.5e-3          # m: an end less certain than this may be another one
 STRAYED_PX = 8.0        # of a path from the fit that began there: unless its ends are clear, it has lost part of the device
-RESTLESS_PX = 0.5       # of a fit's last step: it has not come to rest yet, and is fitted once more
+RESTLESS_PX = 0.3       # of a fit's last step: it has not come to rest yet, and is fitted once more
 ASIDE = 0.6             # darkness beside where a tracked fit would go on, as a share of the device's, that makes one search anew
 JUMPED = 4e-3           # m: an end farther from where it was, or should be by now, may have slipped on to another line
 
@@ -120,6 +120,8 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
         for points, lines, coarse in starts:
             for _ in range(times):
                 fitted = fit(sheet, points, radius, coarse, clearing=clearing)
+                if not any(lines):
+                    fitted = at_rest(sheet, fitted, radius, clearing=clearing)
                 if fitted is None:
                     break
                 attempt = attempt_of(fitted, lines, points)
@@ -261,9 +263,7 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     start = follow(sheet, guess, radius)
     if start is None or not borne_out(start, guess):
         return None
-    fitted = fit(sheet, start, radius, 1, LOOKED_PX)
-    if fitted is not None and fitted.moved_px > RESTLESS_PX:
-        fitted = fit(sheet, fitted.curve(200), radius, 0, LOOKED_PX)
+    fitted = at_rest(sheet, fit(sheet, start, radius, 1, LOOKED_PX), radius, beyond_px=LOOKED_PX)
     found = _near(sheet, fitted, min_length_px, guess)
     if found is None or fitted.moved_px > RESTLESS_PX or not _expected(fitted, guess):
         return None
@@ -271,6 +271,11 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
         return None
     sharp = (fitted.open_end | (fitted.end_sigma < SHARP)).all()
     return replace(found, sure=bool(found.sure and sharp and whole(fitted.stop - fitted.start, guess, sheet.views)))
+
+
+def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options) -> Fit | None:
+    """A fit from a path that may be some px off, once more where it has not come to rest. options: of fit."""
+    return fitted if fitted is None or fitted.moved_px <= RESTLESS_PX else fit(sheet, fitted.curve(200), radius, 0, **options)
 
 
 def _strayed_px(path: np.ndarray, f: Fit, view) -> float:
