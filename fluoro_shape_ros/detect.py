@@ -121,7 +121,7 @@ def detect(sheet: Sheet, radius: float, min_length_px: float, guess: Guess | Non
             for _ in range(times):
                 fitted = fit(sheet, points, radius, coarse, clearing=clearing)
                 if not any(lines):
-                    fitted = at_rest(sheet, fitted, radius, clearing=clearing)
+                    fitted = _at_rest(sheet, fitted, radius, clearing=clearing)
                 if fitted is None:
                     break
                 attempt = attempt_of(fitted, lines, points)
@@ -235,7 +235,7 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
 
     Where it may be another line, the whole images must be searched, too: `sure` tells.
     """
-    found = _near(sheet, fit(sheet, points, radius, coarse), min_length_px, guess)
+    found = _worth_believing(sheet, fit(sheet, points, radius, coarse), min_length_px, guess)
     if found is None:
         return None
     ends, before = found.fit.curve(2), points[[0, -1]]
@@ -243,7 +243,7 @@ def track(sheet: Sheet, radius: float, min_length_px: float, points: np.ndarray,
     return replace(found, sure=found.sure and not jumped)
 
 
-def _near(sheet: Sheet, fitted: Fit | None, min_length_px: float, guess: Guess | None) -> Detection | None:
+def _worth_believing(sheet: Sheet, fitted: Fit | None, min_length_px: float, guess: Guess | None) -> Detection | None:
     """A fit that no line of the images led to, if it may be believed; whether it is `sure`."""
     if fitted is None or blunt(fitted).any() or (fitted.alone >= 0).any():
         return None
@@ -263,8 +263,8 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     start = follow(sheet, guess, radius)
     if start is None or not borne_out(start, guess):
         return None
-    fitted = at_rest(sheet, fit(sheet, start, radius, 1, LOOKED_PX), radius, beyond_px=LOOKED_PX)
-    found = _near(sheet, fitted, min_length_px, guess)
+    fitted = _at_rest(sheet, fit(sheet, start, radius, 1, LOOKED_PX), radius, beyond_px=LOOKED_PX)
+    found = _worth_believing(sheet, fitted, min_length_px, guess)
     if found is None or fitted.moved_px > RESTLESS_PX or not _expected(fitted, guess):
         return None
     if not clear(fitted) and max(_strayed_px(start, fitted, v) for v in sheet.views) > STRAYED_PX:
@@ -273,7 +273,7 @@ def found_near(sheet: Sheet, radius: float, min_length_px: float, guess: Guess) 
     return replace(found, sure=bool(found.sure and sharp and whole(fitted.stop - fitted.start, guess, sheet.views)))
 
 
-def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options) -> Fit | None:
+def _at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options) -> Fit | None:
     """A fit from a path that may be some px off, once more where it has not come to rest. options: of fit."""
     return fitted if fitted is None or fitted.moved_px <= RESTLESS_PX else fit(sheet, fitted.curve(200), radius, 0, **options)
 
