@@ -14,10 +14,10 @@ from fluoro_shape_ros.data import Outcome, Reconstruction, Shape
 from fluoro_shape_ros.geometry import decompose, project, source
 from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.sim import carm, scenes
-from fluoro_shape_ros.tools import bench, bench_table, composites, families, speed, trial
-from fluoro_shape_ros.tools.bound import Bound
+from fluoro_shape_ros.bench import composites, families, main, speed, table, trial
+from fluoro_shape_ros.bench.bound import Bound
 from fluoro_shape_ros.tools.cli import ToolError
-from fluoro_shape_ros.tools.trial import Answer, Task, Trial
+from fluoro_shape_ros.bench.trial import Answer, Task, Trial
 
 SMALL = carm.biplane(arm=carm.CArm(pixel_size_iso=1e-3, width=320, height=320))
 
@@ -35,7 +35,7 @@ GIVEN = [found(0.1, 0.5, 1.0), found(0.3, 1.0, 7.8), found(0.32, 0.1, 7.9), foun
 
 
 def test_row_counts_what_is_good_wrong_and_honest():
-    row = bench_table.row(GIVEN)
+    row = table.row(GIVEN)
     assert (row.scenes, row.answered, row.within, row.silent, row.reported, row.honest) == (9, 6, 2, 2, 3, 2)
     assert row.rejections == {'curvature_too_high': 2, 'length_out_of_bounds': 1}
     assert_allclose([row.errors['mean'].mean, row.errors['mean'].worst], [2.12e-3 / 6, 1.2e-3])
@@ -43,7 +43,7 @@ def test_row_counts_what_is_good_wrong_and_honest():
 
 
 def test_where_no_device_is_every_shape_is_a_silent_failure():
-    row = bench_table.row([Answer(0, Outcome.OK, device=False), Answer(1, Outcome.NO_DEVICE_A, device=False)])
+    row = table.row([Answer(0, Outcome.OK, device=False), Answer(1, Outcome.NO_DEVICE_A, device=False)])
     assert (row.device, row.answered, row.silent, row.within, row.errors) == (False, 1, 1, 0, {})
 
 
@@ -51,7 +51,7 @@ def test_table_has_a_line_a_family_and_method():
     trials = [Trial(Task('p', k, ('spline', 'paper')), {'spline': answer, 'paper': Answer(k, Outcome.NO_DEVICE_A)}, Bound(2e-5, 1e-4, 9e-5))
               for k, answer in enumerate(GIVEN)]
     trials.append(Trial(Task('blank', 0, ('spline', 'paper')), {m: Answer(0, Outcome.NO_DEVICE_B, device=False) for m in ('spline', 'paper')}, None))
-    lines = bench_table.table(bench_table.rows(trials)).splitlines()
+    lines = table.table(table.rows(trials)).splitlines()
     assert max(map(len, lines)) < 140
     shares, errors_mm = lines[1:5], [line.split() for line in lines[7:9]]
     assert shares[0].split() == 'p spline 9 67 % 22 % 2 67 % 2 curvature_too_high, 1 length_out_of_bounds'.split()
@@ -64,11 +64,11 @@ def test_table_has_a_line_a_family_and_method():
 
 def test_plot_shows_silent_failures_in_their_colour(tmp_path):
     pytest.importorskip('matplotlib')
-    from fluoro_shape_ros.tools import bench_plot
+    from fluoro_shape_ros.bench import plot
 
     def red_pixels(answers):
         file = tmp_path / 'bench.png'
-        bench_plot.draw([Trial(Task('p', k, ('spline',)), {'spline': a}, Bound(2e-5, 1e-4, 9e-5)) for k, a in enumerate(answers)], file)
+        plot.draw([Trial(Task('p', k, ('spline',)), {'spline': a}, Bound(2e-5, 1e-4, 9e-5)) for k, a in enumerate(answers)], file)
         image = cv2.imread(str(file)).astype(int)
         assert image.shape[1] == 1500 and image.std() > 5
         return (np.abs(image - [0x5f, 0x5a, 0xff]).max(axis=2) < 3).sum()
@@ -112,7 +112,7 @@ def test_answer_gives_what_a_user_knows_and_measures_what_comes(monkeypatch):
 def test_accuracy_is_written_as_json_and_does_not_depend_on_the_number_of_jobs(tmp_path, capfd):
     def run(jobs):
         file = tmp_path / f'{jobs}.json'
-        assert bench.main(['accuracy', '--families', 'p_xray', '--methods', 'spline', '--scenes', '2', '--first-seed', '7', '--jobs', str(jobs),
+        assert main.main(['accuracy', '--families', 'p_xray', '--methods', 'spline', '--scenes', '2', '--first-seed', '7', '--jobs', str(jobs),
                            '--json', str(file)]) == 0
         return file.read_text(), capfd.readouterr().out
 
@@ -141,7 +141,7 @@ def test_accuracy_is_written_as_json_and_does_not_depend_on_the_number_of_jobs(t
 ])
 def test_what_cannot_be_benched_is_named_at_once(arguments, code, word, capsys):
     try:
-        assert bench.main(arguments) == code
+        assert main.main(arguments) == code
     except SystemExit as stop:
         assert stop.code == code
     assert word in capsys.readouterr().err.splitlines()[-1]
@@ -149,7 +149,7 @@ def test_what_cannot_be_benched_is_named_at_once(arguments, code, word, capsys):
 
 def test_help_names_all_families():
     for command, group in (('accuracy', families.ACCURACY), ('robustness', families.ROBUSTNESS)):
-        text = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.tools.bench', command, '--help'], capture_output=True, text=True, check=True).stdout
+        text = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', command, '--help'], capture_output=True, text=True, check=True).stdout
         assert all(f'  {name} ' in text for name in group)
 
 
@@ -265,7 +265,7 @@ def test_bad_folders_are_named(real, tmp_path_factory):
 
 def test_speed_is_printed_full_and_tracked_and_written(tmp_path, capsys):
     file = tmp_path / 'speed.json'
-    assert bench.main(['speed', '--sizes', '1024', '--scenes', '2', '--rounds', '1', '--alone', '--json', str(file)]) == 0
+    assert main.main(['speed', '--sizes', '1024', '--scenes', '2', '--rounds', '1', '--alone', '--json', str(file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line[7:24].strip() for line in lines[1:3]] == ['spline, full', 'spline, tracked']
     assert any('spline, full: detect' in line for line in lines) and any('spline, tracked: track' in line for line in lines)
@@ -290,5 +290,5 @@ def test_what_is_wrong_is_not_timed(monkeypatch, capsys):
     found = speed.measure(320, 1, 1, 0, compared=0)
     assert [(laps.scenes, laps.right, laps.seconds) for laps in found] == [(1, 0, [])] * 2
     assert 'nan' in speed.table(found + [speed.Laps(320, speed.PAPER, 1, 0, [1.0], [0.1], [1.0])])
-    assert bench.main(['speed', '--sizes', '320', '--scenes', '1', '--alone']) == 1
+    assert main.main(['speed', '--sizes', '320', '--scenes', '1', '--alone']) == 1
     assert 'none of 1 scenes' in capsys.readouterr().err

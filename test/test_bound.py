@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.curve import arc_length
 from fluoro_shape_ros.sim import carm, placement, scenes, shapes, xray
-from fluoro_shape_ros.tools import bound
+from fluoro_shape_ros.bench import bound
 
 PITCH, LENGTH, RADIUS, BLUR, CONTRAST, PHOTONS = 0.5e-3, 0.05, 0.0004, 2.0, 0.01, 1000.0
 VIEWS = carm.biplane(arm=carm.CArm(pixel_size_iso=PITCH, width=160, height=160))

@@ -20,7 +20,7 @@ from fluoro_shape_ros.prior import look
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.strips import Sheet
-from fluoro_shape_ros.tools.families import families
+from fluoro_shape_ros.bench.families import families
 
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
 RADIUS, HALF_WIDTH = 0.0006, 2.0        # m, and px of it

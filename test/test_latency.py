@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.tools import bench, latency
-from fluoro_shape_ros.tools.memory import Memory
-from fluoro_shape_ros.tools.usage import usage
+from fluoro_shape_ros.bench import latency, main
+from fluoro_shape_ros.bench.memory import Memory
+from fluoro_shape_ros.bench.usage import usage
 
 DOMAIN = 151 + os.getpid() % 50     # not those of other tests
 ROW = latency.Row(30.0, 2.0, sent=60, answered=4, refused=3, dropped=50, latency=[0.01, 0.02, 0.03, 0.04], compute=[0.004, 0.004, 0.02, 0.036],
@@ -67,12 +67,12 @@ def test_the_device_moves_as_fast_as_it_should():
 ])
 def test_unusable_arguments(arguments, word, capsys):
     with pytest.raises(SystemExit, match='2'):
-        bench.main(arguments)
+        main.main(arguments)
     assert word in capsys.readouterr().err
 
 
 def run(*arguments, file):
-    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.tools.bench', *arguments, '--rendered', '6', '--domain', str(DOMAIN), '--json', str(file)],
+    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', *arguments, '--rendered', '6', '--domain', str(DOMAIN), '--json', str(file)],
                           capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stderr
     return done.stdout, json.loads(file.read_text())

@@ -16,10 +16,10 @@ from fluoro_shape_ros.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.spline import Spline3
-from fluoro_shape_ros.tools import bench_prior
-from fluoro_shape_ros.tools.bench_prior import Try, predictions, pushed
-from fluoro_shape_ros.tools.families import families
-from fluoro_shape_ros.tools.trial import Answer, answer_of
+from fluoro_shape_ros.bench import prediction
+from fluoro_shape_ros.bench.prediction import Try, predictions, pushed
+from fluoro_shape_ros.bench.families import families
+from fluoro_shape_ros.bench.trial import Answer, answer_of
 
 SECOND = 10**9
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
@@ -118,7 +118,7 @@ def test_the_bench_counts_by_hand():
     good = Answer(0, Outcome.OK, errors=Errors(0.1e-3, 0, 0, 0.2e-3, 0, 0))
     without = [Try(good, 0.2, 0.0, ''), Try(Answer(1, Outcome.NO_DEVICE_A), 0.2, 0.0, '')]
     done = [Try(good, 0.1, 0.01e-3, 'agrees'), Try(good, 0.05, float('nan'), 'ignored: it is stale')]
-    line = bench_prior._line('clutter', 'good', done, without).split()
+    line = prediction._line('clutter', 'good', done, without).split()
     assert line == 'clutter good 2 of 2 2 0 0.100 0.200 3.00 1 of 2 0.010 1 agrees, 1 ignored'.split()
 
 

@@ -19,7 +19,7 @@ from ..data import Outcome, Prior, Reconstruction
 from ..metrics import Errors, compare, surprise
 from ..pipeline import reconstruct
 from .bound import Bound, bound
-from .cli import ToolError
+from ..tools.cli import ToolError
 from .families import Case, families
 
 WITHIN_MEAN, WITHIN_TIP = 0.3e-3, 1e-3  # m: an answer as good as this is good

@@ -12,9 +12,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..config import fields
-from . import bench_prior, latency, memory, speed
-from .bench_table import plain, rows, table
-from .cli import ToolError, count, natural, need, positive, run
+from . import latency, memory, prediction, speed
+from .table import plain, rows, table
+from ..tools.cli import ToolError, count, natural, need, positive, run
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Family, families, on_real
 from .latency import moving_scenes
@@ -53,18 +53,18 @@ def _add_speed(commands) -> None:
 
 
 def _add_prior(commands) -> None:
-    prior = commands.add_parser('prior', help='what a predicted_backbone is worth on the first pair, good or wrong')
-    prior.add_argument('--families', nargs='+', metavar='NAME', choices=list(families()), default=list(bench_prior.FAMILIES),
-                       help=f'see accuracy and robustness; and faint, a fortieth of the dose (default: {" ".join(bench_prior.FAMILIES)})')
-    prior.add_argument('--scenes', type=count, default=10, metavar='N', help='scenes of each family (default: 10)')
-    prior.add_argument('--rounds', type=count, default=3, metavar='N', help='how often each is timed (default: 3)')
-    prior.add_argument('--first-seed', type=natural, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
-    prior.set_defaults(body=_prior)
+    command = commands.add_parser('prior', help='what a predicted_backbone is worth on the first pair, good or wrong')
+    command.add_argument('--families', nargs='+', metavar='NAME', choices=list(families()), default=list(prediction.FAMILIES),
+                       help=f'see accuracy and robustness; and faint, a fortieth of the dose (default: {" ".join(prediction.FAMILIES)})')
+    command.add_argument('--scenes', type=count, default=10, metavar='N', help='scenes of each family (default: 10)')
+    command.add_argument('--rounds', type=count, default=3, metavar='N', help='how often each is timed (default: 3)')
+    command.add_argument('--first-seed', type=natural, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    command.set_defaults(body=_prior)
 
 
 def _prior(args, parser: argparse.ArgumentParser) -> int:
     """Print the table of predictions."""
-    print(bench_prior.report(args.families, args.scenes, args.first_seed, args.rounds))
+    print(prediction.report(args.families, args.scenes, args.first_seed, args.rounds))
     return 0
 
 
@@ -190,7 +190,7 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
         args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'limits': LIMITS, 'rows': plain(found),
                                          'trials': [_plain(t) for t in trials]}, indent=1) + '\n')
     if args.plot:
-        from .bench_plot import draw    # imports matplotlib
+        from .plot import draw    # imports matplotlib
         draw(trials, args.plot)
     return 0
 

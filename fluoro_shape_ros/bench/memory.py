@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..sim.scenes import Scene
-from .cli import ToolError
+from ..tools.cli import ToolError
 from .latency import first_result, timed_node
 from .usage import usage
 

@@ -17,8 +17,8 @@ from tqdm import tqdm
 
 from ..sim import scenes
 from ..sim.carm import CArm, biplane
-from . import cli
-from .demo import child
+from ..tools import cli
+from ..tools.demo import child
 from .speed import FIELD
 from .usage import usage
 
@@ -88,7 +88,7 @@ def timed_node(scene: scenes.Scene, folder: Path, parameters: dict[str, object] 
     given = {'robot_radius': float(scene.radius), 'base_position': [round(float(x), 6) for x in scene.base_position], 'reference_frame': scene.frame.frame_id,
              **(parameters or {})}
     words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
-    with child(['-m', 'fluoro_shape_ros.tools.timed_node', str(folder / 'laps'), '--ros-args', *words], folder / 'node.log') as process:
+    with child(['-m', 'fluoro_shape_ros.bench.timed_node', str(folder / 'laps'), '--ros-args', *words], folder / 'node.log') as process:
         yield process
 
 

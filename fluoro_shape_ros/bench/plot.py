@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from .bench_table import share
-from .pictures import FOUND, GRID, MISSED, STYLE, TEXT, TIP, TRUTH
+from .table import share
+from ..tools.pictures import FOUND, GRID, MISSED, STYLE, TEXT, TIP, TRUTH
 from .trial import WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 
 COLOURS = (FOUND, MISSED, '#b48cff', '#7ee081')     # of methods

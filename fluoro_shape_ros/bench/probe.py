@@ -24,7 +24,7 @@ from msg_adapters.messages import header, ros_message
 from ..data import Outcome
 from ..sim.publisher import PLANES, calibration, optical_frame
 from ..sim.scenes import Scene, ping_pong
-from .own_node import OwnNode
+from ..tools.own_node import OwnNode
 
 IMAGE_DEPTH = 5
 CALL_EVERY_S = 0.25

@@ -19,7 +19,7 @@ from ..field import field_of_view
 from ..geometry import GeometryError, isocenter, make_view
 from ..sim import placement, xray
 from ..sim.scenes import FRAME_ID, Scene
-from .cli import ToolError
+from ..tools.cli import ToolError
 
 RADIUS = 0.00045            # m: a guidewire
 LENGTHS = (0.06, 0.13)      # m

@@ -1,0 +1,1 @@
+"""How accurate, how robust and how fast the reconstruction is, on scenes with known truth."""
