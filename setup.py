@@ -24,7 +24,9 @@ EXTRAS = {
     'report': ['plotly>=5.18'],
     'dicom': ['pydicom>=3.0.1', 'python-gdcm>=3.0.24.1'],     # GDCM decodes the lossless JPEG that most angiographs write
     'vtk': ['vtk>=9.3'],
+    'gvxr': ['gvxr>=2.1' + WHEELS],
     'plot': ['matplotlib>=3.6'],
+    'cluster': ['distributed>=2024.2'],
 }
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
@@ -55,7 +57,7 @@ setup(
     ],
     entry_points={'console_scripts': [f'{name} = {module}:main' for name, module in EXECUTABLES.items()]},
     python_requires='>=3.11',
-    install_requires=['numpy>=1.26.4', 'scipy>=1.11.4', 'opencv-python-headless>=4.6', 'scikit-image>=0.22', 'tqdm>=4.60'],
+    install_requires=['numpy>=1.26.4', 'scipy>=1.11.4', 'opencv-python-headless>=4.6', 'scikit-image>=0.22', 'tqdm>=4.60', 'pyyaml>=6.0'],
     extras_require=EXTRAS,
     zip_safe=True,
 )
