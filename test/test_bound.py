@@ -83,8 +83,8 @@ def test_information_is_what_moving_the_device_does_to_the_images():
              (np.concatenate([curve, curve[-1:] + tangent[-1] * step]), curve[:-1])]
     at, found, expected = [2 * k, 2 * k + 1, -1], 0.0, 0.0
     for i in (0, 1):
-        noise = np.sqrt(device.noise_variance(device.blurred(device.sharp(curve, i))))
-        rows = np.array([((device.blurred(device.sharp(ahead, i)) - device.blurred(device.sharp(behind, i))) / noise).ravel() for ahead, behind in moves])
+        noise = np.sqrt(device.noise_variance(device.blurred(device.sharp(curve, i), i), i))
+        rows = np.array([((device.blurred(device.sharp(ahead, i), i) - device.blurred(device.sharp(behind, i), i)) / noise).ravel() for ahead, behind in moves])
         expected = expected + rows @ rows.T / (2 * step)**2
         found = found + bound.information(device, i, curve, tangent, normals, basis)[np.ix_(at, at)]
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))

@@ -82,12 +82,12 @@ def information(run: Run, i: int, curve: np.ndarray, tangent: np.ndarray, normal
     ends = np.clip(2 - np.stack([s, s[-1] - s], axis=1) / END, 0, 1)
     sideways = np.einsum('pj,pa->pja', basis[at], np.einsum('pi,pia->pa', change, normals[at]))
     along = ends[at] * np.einsum('pi,pi->p', change, tangent[at])[:, None]
-    noise = np.sqrt(run.noise_variance(run.blurred(run.sharp(curve, i)))[box])
+    noise = np.sqrt(run.noise_variance(run.blurred(run.sharp(curve, i), i), i)[box])
     rows = []
     for of_parameter in np.concatenate([sideways.reshape(len(at), -1), along], axis=1).T:
         image = np.zeros(noise.shape, np.float32)
         image[tuple(shadow.T)] = of_parameter
-        rows.append((run.blurred(image) / noise).ravel())
+        rows.append((run.blurred(image, i) / noise).ravel())
     rows = np.array(rows, float)
     return rows @ rows.T
 

@@ -129,6 +129,11 @@ def _cannula(rng: np.random.Generator, length: float, views) -> shapes.Cannula:
     return shapes.random_cannula(rng, length)
 
 
+def _bent(rng: np.random.Generator, length: float, views) -> shapes.Spline:
+    """A curve that may hook back on itself, with bends of a radius from 12 mm on."""
+    return shapes.random_spline(rng, length, rng.uniform(0.5, 2.0) * shapes.MAX_CURVATURE, np.deg2rad(150))
+
+
 def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
     """A loose turn of a screw, as a catheter loops, with its axis near one of the viewing directions; it bends as tight as other shapes do."""
     knots = np.arange(max(4, int(np.ceil(length / shapes.KNOT_SPACING)) + 1))
@@ -148,6 +153,7 @@ def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
 KINDS: dict[str, tuple[Callable, Callable]] = {
     'spline': (_spline, well_seen),
     'cannula': (_cannula, well_seen),
+    'bent': (_bent, well_seen),
     'tangent': (_spline, turns_back),
     'crossing': (_looped, crosses_itself),
 }

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..device import Device
 from . import anatomy, carm, placement
 from .kinematics import TendonRobot, Tube, TubeRobot, loaded, reaching
-from .scenes import RADIUS, Run, Scene
+from .scenes import FLUOROSCOPY, RADIUS, Run, Scene, with_device
 from .shapes import Pose
 from .xray import Exposure
 
@@ -58,14 +59,17 @@ class Plant:
         return self.run.scene_of(placement.with_shaft(self.backbone(q), SHAFT), index, stamp_ns)
 
 
-def plant(name: str, seed: int, size: int = 512, with_anatomy: bool = True, error: float = MODEL_ERROR, pushed: tuple[float, float] = PUSHED) -> Plant:
+def plant(name: str, seed: int, size: int = 512, with_anatomy: bool = True, error: float = MODEL_ERROR, pushed: tuple[float, float] = PUSHED,
+          device: Device | None = None) -> Plant:
     """The robot `name` of ROBOTS as the seed makes it: it bends by `error` otherwise, and a load moves its tip aside by `pushed` m at the start, so
-    that the two do not cancel. Images have `size` x `size` px and always show the same field.
+    that the two do not cancel. Images have `size` x `size` px and always show the same field. It is a rod, or looks like `device` under fluoroscopy.
     """
     known, rng = ROBOTS[name], np.random.default_rng([seed, 8])
     views = carm.biplane(arm=carm.CArm(pixel_size_iso=FIELD / size, width=size, height=size))
     beams = tuple(anatomy.anatomy(np.random.default_rng([seed, 3, i]), (size, size)) for i in (0, 1)) if with_anatomy else None
     run = Run(f'servo_{name}', seed, tuple(placement.Field(v) for v in views), None, 0.0, RADIUS, 'xray', Exposure(), beams)
+    if device is not None:
+        run = with_device(run, device, (FLUOROSCOPY, FLUOROSCOPY))
     points = known.robot.backbone(known.start, STEP)
     aside = np.cross(points[-1] - points[-2], rng.normal(size=3))
     length = STEP * (len(points) - 1)

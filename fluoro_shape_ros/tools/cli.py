@@ -6,6 +6,8 @@ import argparse
 import importlib
 import sys
 
+from ..device import DeviceError, load_device
+
 
 class ToolError(Exception):
     """A failure the tool can name in one line: exit code 1."""
@@ -35,6 +37,15 @@ def need(module: str, extra: str):
 
 
 # ---- types of arguments
+
+
+def device(text: str) -> str:
+    """The name or file of a device, as it is given, once it is known to be one."""
+    try:
+        load_device(text)
+    except DeviceError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
 
 
 def positive(text: str) -> float:

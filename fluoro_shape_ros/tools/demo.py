@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..config import fields
+from ..device import load_device, presets
 from . import cli, pictures
 from .score import Score, headline, live_line, summary
 
@@ -43,6 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--seed', type=int, default=9, help='another seed is another device')
     add('--method', choices=method.metadata['choices'], default=method.default, help='parameter of the node')
     add('--renderer', choices=('xray', 'vtk'), default='xray', help='X-ray attenuation, or the VTK tube with blur and white noise of Burgner et al. 2011')
+    add('--device', metavar='NAME|FILE', type=cli.device, help=f'what it looks like, under fluoroscopy: a file, or {", ".join(presets())} (xray only)')
     add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine (xray only); the method `paper` needs it')
     add('--out', type=Path, default=Path('fluoro_shape_demo'), metavar='FOLDER', help='pictures and logs go there')
     add('--domain', type=int, default=47, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
@@ -91,7 +93,11 @@ def commands(args) -> dict[str, list[str]]:
     sim = ['--seed', str(args.seed), '--rate', str(args.rate), '--renderer', args.renderer, '--prerender', str(RENDERED), '--wait', str(STARTUP_S)]
     if args.no_anatomy:
         sim.append('--no-anatomy')
-    return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}'],
+    radius = []
+    if args.device:
+        sim += ['--device', args.device]
+        radius = ['-p', f'robot_radius:={load_device(args.device).radius}']
+    return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}', *radius],
             'sim': ['-m', 'fluoro_shape_ros.tools.sim', *sim, *device, '--reference-frame', FRAME]}
 
 

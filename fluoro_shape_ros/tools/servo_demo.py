@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..device import load_device, presets
 from ..sim.plant import MODEL_ERROR, ROBOTS, plant
 from . import cli
 
@@ -36,6 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--blackout', action='store_true', help='halfway along the square, plane B does not show the device for 1 s')
     add('--rate', type=_rate, default=15.0, metavar='HZ', help='pairs a second')
     add('--size', type=cli.count, default=512, metavar='PX', help='of the images, which always show 154 mm')
+    add('--device', metavar='NAME|FILE', type=cli.device, help=f'what the robot looks like under fluoroscopy, instead of a rod: a file, or {", ".join(presets())}')
     add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine')
     add('--no-mask', action='store_true', help='no mask is captured before the robot comes into the field')
     add('--out', type=Path, default=Path('fluoro_shape_servo_demo'), metavar='FOLDER', help='the picture and logs go there')
@@ -65,7 +67,7 @@ def _run(args) -> int:
     for k in range(args.runs):
         runs.append(run(args, args.seed + k))
         print(line(runs[-1], args.rate), flush=True)
-    moved = plant(args.robot, args.seed, args.size, not args.no_anatomy)
+    moved = plant(args.robot, args.seed, args.size, not args.no_anatomy, device=load_device(args.device) if args.device else None)
     print(f'picture     {draw(runs[0], args.out / "servo.png", moved)}', flush=True)
     missed = sum(r.final.max() > TOLERANCE for r in runs)
     if missed:

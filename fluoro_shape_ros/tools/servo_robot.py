@@ -18,6 +18,7 @@ from msg_adapters.messages import header, ros_message, stamp_ns
 from msg_adapters.shapes import shape_to_path
 
 from ..data import Frame
+from ..device import load_device
 from ..sim import plant
 from ..sim.kinematics import driven
 from ..sim.publisher import FluoroSim, true_shape, use_large_image_profile
@@ -111,6 +112,7 @@ def main(argv=None) -> int:
     own = argparse.ArgumentParser('servo_robot', description='The robot of fluoro_shape_servo_demo.')
     own.add_argument('--robot', choices=tuple(plant.ROBOTS), required=True)
     own.add_argument('--no-anatomy', action='store_true')
+    own.add_argument('--device')
     for name, kind in (('--seed', int), ('--rate', float), ('--size', int)):
         own.add_argument(name, type=kind, required=True)
     return cli.run(_run, own, argv)
@@ -118,7 +120,7 @@ def main(argv=None) -> int:
 
 def _run(args) -> int:
     use_large_image_profile()
-    what = plant.plant(args.robot, args.seed, args.size, not args.no_anatomy)
+    what = plant.plant(args.robot, args.seed, args.size, not args.no_anatomy, device=load_device(args.device) if args.device else None)
     stop = threading.Event()
     with FluoroSim() as xray, Robot(args.robot, args.rate, what) as robot:
         def end(*_) -> None:

@@ -8,13 +8,15 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from ..device import load_device, presets
 from ..geometry import check_pair
 from ..node import own_arguments
-from ..sim import carm, scenes, xray
+from ..sim import carm, ct, imaging, scenes, variety, xray
 from ..sim.placement import KINDS
 from . import cli
 
@@ -60,6 +62,8 @@ _DEVICE = (
     ('--moving', 'the device slides and bends', dict(action='store_true')),
     ('--length', 'range of its length, m (default 0.067 0.188)', dict(type=cli.positive, nargs=2, default=scenes.LENGTHS, metavar=('MIN', 'MAX'))),
     ('--radius', 'm', dict(type=cli.positive, default=scenes.RADIUS, metavar='M')),
+    ('--device', f'what it is made of, instead of a rod of --radius and --contrast: a file, or {", ".join(presets())}; xray only',
+     dict(type=cli.device, metavar='NAME|FILE')),
     ('--entering', 'the shaft comes in through the border of both images', dict(action='store_true')),
 )
 _IMAGES = (
@@ -68,6 +72,9 @@ _IMAGES = (
     ('--depth', 'bits a pixel; above 8 the images are mono16; xray only', dict(type=int, choices=(8, 10, 12, 14, 16), default=8)),
     ('--photons', 'detected a pixel in the open beam: the fewer, the noisier; xray only', dict(type=cli.positive, default=1500.0)),
     ('--contrast', 'share of the beam that the device takes away; xray only', dict(type=cli.positive, default=0.25)),
+    ('--imaging', 'physics and display of both planes, with --device fluoroscopy by default; random: each plane drawn anew; --photons and --depth do '
+     'not count then; xray only', dict(choices=(*imaging.SETTINGS, 'random'))),
+    ('--ct', 'a CT behind the device, from anywhere: a .npz file with hu and spacing_m, or a folder with a DICOM series; xray only', dict(type=Path, metavar='FILE')),
     ('--no-anatomy', 'an even background; xray only', dict(action='store_true')),
     ('--clutter', 'what else is in the field; xray only', dict(nargs='+', choices=scenes.CLUTTER, default=())),
 )
@@ -107,7 +114,16 @@ def make_run(args) -> scenes.Run:
     check_pair(views)
     device = {'views': views, 'kind': args.shape, 'lengths': tuple(args.length), 'radius': args.radius, 'entering': args.entering}
     if args.renderer == 'vtk':
+        if args.device or args.imaging or args.ct:
+            raise ValueError('--device, --imaging and --ct need --renderer xray')
         return scenes.protocol_p_run(args.seed, **device)
+    if args.device:
+        device['device'] = load_device(args.device)
+    if args.imaging:
+        rng = np.random.default_rng([args.seed, 10])
+        device['chains'] = tuple(imaging.draw(rng) if args.imaging == 'random' else imaging.SETTINGS[args.imaging] for _ in views)
+    if args.ct:
+        device['background'] = variety.in_ct(ct.load_ct(args.ct), np.random.default_rng([args.seed, 8]))
     exposure = xray.Exposure(photons=args.photons, contrast=args.contrast, depth=args.depth)
     return scenes.xray_run(args.seed, exposure=exposure, anatomy=not args.no_anatomy, clutter=tuple(args.clutter), **device)
 
