@@ -2,12 +2,12 @@
 
 ACCURACY scenes have nothing in them but the device, so that the Cramer-Rao bound applies. ROBUSTNESS scenes are X-ray images over anatomy
 (0.3 mm a pixel, planes 90 degrees apart, 1500 photons a pixel, 25 % contrast), each with one more difficulty. HARDER ones show what a prediction is worth.
+`variety` draws everything at random: device, geometry, anatomy, physics of the image and display; see sim/variety.py.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +15,13 @@ import cv2
 import numpy as np
 
 from ..data import Frame
-from ..sim import carm, scenes, xray
-from ..sim.scenes import Run, Scene
+from ..device import presets
+from ..sim import carm, ct, scenes, variety as wide, xray
+from ..sim.scenes import Run
+from ..tools.cli import ToolError
+from .case import Case, Family
 from .composites import composite
+from .open_scenes import open_family
 
 HIDDEN_PX = 25.0                            # of the device, behind the occluder
 CALIBRATION_ERROR_PX = 0.5
@@ -28,27 +32,59 @@ SHORT, LONG = (0.067, 0.150), (0.140, 0.188)    # m: fits the field of 0.2 mm/px
 
 
 @dataclass(frozen=True)
-class Case:
-    """A scene, and what belongs to it."""
+class Sources:
+    """Files that only some families are made from."""
 
-    scene: Scene
-    masks: tuple[np.ndarray, np.ndarray] | None = None      # (H, W) float32 device-free images
-    note: str = ''                                          # what the seed has drawn
-    run: Run | None = None                                  # what a bound can be computed from
-
-
-@dataclass(frozen=True)
-class Family:
-    """Scenes of one kind."""
-
-    text: str
-    make: Callable[[int], Case]     # of a seed
-    device: bool = True             # False: no pair of images shows a device, so every published shape is wrong
+    ct: Path | None = None      # a CT volume; see sim/ct.py
+    open: Path | None = None    # a folder of scenes; see open_scenes.py
 
 
 def families(real: Path | None = None) -> dict[str, Family]:
     """All families by name; those on real backgrounds exist where their folder `real` is given."""
     return ACCURACY | ROBUSTNESS | HARDER | (on_real(real) if real else {})
+
+
+def varied(sources: Sources = Sources()) -> dict[str, Family]:
+    """The families drawn from a world as wide as the clinic; some exist only where their source is given."""
+    found = {
+        'wide': Family('a solid rod: radius, contrast, geometry, dose, blur, scatter and display drawn', lambda seed: _varied(wide.wide_run(seed))),
+        'wide_anatomy': Family('the same before drawn anatomy', lambda seed: _varied(wide.wide_run(seed, anatomy=True))),
+        'wide_blank': Family('the same without the rod', lambda seed: _without(_rod_run(seed)), device=False),
+        'wide_one_plane': Family('the same with the rod in one plane only', lambda seed: _in_one_plane(_rod_run(seed)), device=False),
+        'devices': Family(f'{", ".join(presets())}, in turn, before drawn anatomy', lambda seed: _varied(wide.device_run(seed), kind=True)),
+        'gvxr': Family('tubes and rods in tissue, drawn by gVirtualXray at 0.2 mm a pixel', lambda seed: _varied(wide.gvxr_run(seed), kind=True)),
+    }
+    if sources.ct:
+        found |= {
+            'ct': Family('the same devices in a CT, every second one entering through the border', lambda seed: _varied(wide.ct_run(seed, _volume(sources.ct)), kind=True)),
+            'ct_none': Family('the same without the device', lambda seed: _without(wide.ct_run(seed, _volume(sources.ct))), device=False),
+        }
+    return found | ({'open': open_family(sources.open)} if sources.open else {})
+
+
+def _varied(run: Run, kind: bool = False) -> Case:
+    return Case(run.scene(), note=run.said(), run=run, kind=run.name if kind else '')
+
+
+def _without(run: Run) -> Case:
+    return Case(dataclasses.replace(run.scene(), frame=run.without_device(index=1)), note=run.said())
+
+
+def _rod_run(seed: int) -> Run:
+    return wide.wide_run(seed, anatomy=bool(seed // 2 % 2))
+
+
+def _in_one_plane(run: Run) -> Case:
+    scene, seen = run.scene(), run.seed % 2
+    images = [scene.frame.images[i] if i == seen else run.without_device(index=1).images[i] for i in (0, 1)]
+    return Case(dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, images=tuple(images))), note=f'device in plane {"ab"[seen]} only')
+
+
+def _volume(file: Path) -> ct.Volume:
+    try:
+        return ct.load_ct(file)
+    except ct.CtError as error:
+        raise ToolError(str(error)) from error
 
 
 def on_real(folder: Path) -> dict[str, Family]:

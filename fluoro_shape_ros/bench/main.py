@@ -12,13 +12,15 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..config import fields
-from . import latency, memory, prediction, speed
-from .table import plain, rows, table
 from ..tools.cli import ToolError, count, natural, need, positive, run
+from . import latency, memory, prediction, speed, variety
+from .case import Family
 from .composites import load
-from .families import ACCURACY, ROBUSTNESS, Family, families, on_real
+from .families import ACCURACY, ROBUSTNESS, Sources, families, on_real
+from .jobs import in_order
 from .latency import moving_scenes
-from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempts
+from .table import plain, rows, table
+from .trial import CHI2_95, PICTURES, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempt
 
 DEVICE = 9              # default seed of what moves in front of the node
 METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
@@ -32,6 +34,7 @@ def main(argv=None) -> int:
     robustness = _add_tables(commands, 'robustness', 'one difficulty at a time, and scenes where nothing may be published', ROBUSTNESS)
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
+    _add_variety(commands)
     _add_speed(commands)
     _add_latency(commands)
     _add_memory(commands)
@@ -145,18 +148,29 @@ def _check_files(*files: Path | None) -> None:
             raise ToolError(f'{file}: there is no such folder')
 
 
-def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
-    """A command that prints the table of `families`."""
-    epilog = 'families:\n' + '\n'.join(f'  {n:12s} {f.text}' for n, f in families.items())
+def _add_scene_command(commands, name: str, text: str, families: dict[str, str], methods: tuple[str, ...]) -> argparse.ArgumentParser:
+    """A command that tries scenes of `families`, whose texts are given by name."""
+    width = max(12, *map(len, families))
+    epilog = 'families:\n' + '\n'.join(f'  {n:{width}s} {family}' for n, family in families.items())
     command = commands.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument('--families', nargs='+', metavar='NAME', help='(default: all)')
-    command.add_argument('--methods', nargs='+', metavar='METHOD', choices=METHODS, default=list(METHODS),
-                         help=f'of {", ".join(METHODS)} (default: all)')
+    command.add_argument('--methods', nargs='+', metavar='METHOD', choices=METHODS, default=list(methods),
+                         help=f'of {", ".join(METHODS)} (default: {"all" if methods == METHODS else " ".join(methods)})')
     command.add_argument('--scenes', type=count, default=20, metavar='N', help='scenes of each family (default: 20)')
     command.add_argument('--first-seed', type=int, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
+    return command
+
+
+def _add_jobs(command) -> None:
     command.add_argument('--jobs', type=count, default=2, metavar='N',
                          help='processes of one thread each; the table does not depend on it (default: 2)')
+
+
+def _add_tables(commands, name: str, text: str, families: dict[str, Family]) -> argparse.ArgumentParser:
+    """A command that prints the table of `families`."""
+    command = _add_scene_command(commands, name, text, {n: f.text for n, f in families.items()}, METHODS)
+    _add_jobs(command)
     command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every scene\'s answers there, in m')
     command.add_argument('--plot', type=Path, metavar='FILE.png', help='draw errors and shares')
     command.set_defaults(body=_tables, group=families, real=None)
@@ -175,15 +189,14 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
     if args.plot and args.plot.suffix.lower() != '.png':
         parser.error(f'--plot {args.plot}: only .png can be drawn')
     _check_files(args.json, args.plot)
-    if args.first_seed < 0:
-        parser.error(f'--first-seed {args.first_seed}: seeds count from 0')
+    _check_first_seed(args, parser)
     if 'p' in names:
         need('vtkmodules.vtkRenderingOpenGL2', 'vtk')
     if args.plot:
         need('matplotlib', 'plot')
     methods = tuple(dict.fromkeys(args.methods))
     tasks = [Task(name, args.first_seed + k, methods, args.real) for name in dict.fromkeys(names) for k in range(args.scenes)]
-    trials = list(tqdm(attempts(tasks, args.jobs), total=len(tasks), unit='scene', disable=None))
+    trials = list(tqdm(in_order(attempt, tasks, args.jobs), total=len(tasks), unit='scene', disable=None))
     found = rows(trials)
     print(table(found))
     if args.json:
@@ -192,6 +205,76 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
     if args.plot:
         from .plot import draw    # imports matplotlib
         draw(trials, args.plot)
+    return 0
+
+
+def _check_first_seed(args, parser: argparse.ArgumentParser) -> None:
+    if args.first_seed < 0:
+        parser.error(f'--first-seed {args.first_seed}: seeds count from 0')
+
+
+def _add_variety(commands) -> None:
+    text = 'a world as wide as the clinic: by family of scenes and kind of device, with CPU time and why pairs are refused'
+    command = _add_scene_command(commands, 'variety', text, variety.texts(), ('spline',))
+    workers = command.add_mutually_exclusive_group()
+    _add_jobs(workers)
+    workers.add_argument('--scheduler', metavar='ADDRESS', help='instead: HOST:PORT of a Dask scheduler, whose workers (dask worker --nthreads 1) '
+                         'need this package and the files below')
+    command.add_argument('--ct', type=Path, metavar='FILE', help='for ct and ct_none: a folder with one DICOM series, or NPZ with hu (z, y, x) and spacing_m')
+    command.add_argument('--open', type=Path, metavar='DIR', help='for open: a folder of scenes, each with plane_a.png, plane_b.png and scene.json; '
+                         'these are taken by name from the first, whatever --first-seed')
+    command.add_argument('--no-base', action='store_true', help='keep the base\'s position back')
+    command.add_argument('--radius-error', type=_radius_error, default=0.0, metavar='R', help='give 1 + R times the true radius (default: 0)')
+    command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every scene\'s answers there, in m and s')
+    command.add_argument('--pictures', type=natural, default=0, metavar='N', help='contact sheets of the first N pairs of each family (default: 0)')
+    command.add_argument('--pictures-of', choices=PICTURES, default='all', help='of those that the first method answered, refused or got wrong (default: all)')
+    command.add_argument('--sheets', type=Path, default=Path('sheets'), metavar='DIR', help='where they go (default: sheets)')
+    command.set_defaults(body=_variety)
+
+
+def _radius_error(text: str) -> float:
+    if not -0.9 <= (share := float(text)) <= 9:
+        raise argparse.ArgumentTypeError(f'{text} does not lie in -0.9 to 9')
+    return share
+
+
+def _sources(args, parser: argparse.ArgumentParser) -> Sources:
+    """What the families are made from, by absolute paths, since a worker may run anywhere; ends where one that is asked for does not exist or lacks its source."""
+    given, texts = {'--ct': args.ct, '--open': args.open}, variety.texts()
+    for name in args.families or ():
+        if name not in texts:
+            parser.error(f'no such family: {name}; there are {", ".join(texts)}')
+        if (option := variety.needed(name)) and not given[option.split()[0]]:
+            parser.error(f'{name} needs {option}')
+    return Sources(**{option[2:]: path and path.absolute() for option, path in given.items()})
+
+
+def _variety(args, parser: argparse.ArgumentParser) -> int:
+    """Try all scenes, print the table, write the files and sheets."""
+    sources = _sources(args, parser)
+    _check_first_seed(args, parser)
+    known = variety.known(sources)
+    names = list(dict.fromkeys(args.families or known))
+    _check_files(args.json)
+    if args.pictures:
+        args.sheets.mkdir(parents=True, exist_ok=True)
+    if 'gvxr' in names:
+        need('gvxrPython3', 'gvxr')
+    if args.scheduler:
+        need('distributed', 'cluster')
+    methods = tuple(dict.fromkeys(args.methods))
+    tasks = [Task(name, seed, methods, sources=sources, base=not args.no_base, radius_error=args.radius_error,
+                  picture=args.pictures_of if args.pictures and (k < args.pictures or args.pictures_of != 'all') else '')
+             for name in names for k, seed in enumerate(variety.seeds(known[name], args.first_seed, args.scenes))]
+    done = tqdm(in_order(attempt, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene', disable=None)
+    trials = list(variety.fewer_pictures(done, args.pictures))
+    print(variety.table(trials))
+    if args.json:
+        given = {'command': args.command, 'first_seed': args.first_seed, 'base': not args.no_base, 'radius_error': args.radius_error}
+        args.json.write_text(json.dumps({**given, 'limits': variety.LIMITS, 'rows': variety.plain(trials),
+                                         'trials': [variety.plain_trial(t) for t in trials]}, indent=1) + '\n')
+    if args.pictures:
+        variety.write_sheets(trials, args.sheets)
     return 0
 
 

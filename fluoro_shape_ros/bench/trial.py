@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import os
-import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+import dataclasses
+import math
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
-import cv2
+import numpy as np
 
-from ..config import Config
+from ..config import Config, ConfigError
 from ..data import Outcome, Prior, Reconstruction
+from ..geometry import pixels_per_metre
 from ..metrics import Errors, compare, surprise
 from ..pipeline import reconstruct
-from .bound import Bound, bound
+from ..sim.scenes import Scene
 from ..tools.cli import ToolError
-from .families import Case, families
+from .bound import Bound, bound
+from .case import Case, Family
+from .families import Sources, families, varied
+from .sheets import thumbnail
 
 WITHIN_MEAN, WITHIN_TIP = 0.3e-3, 1e-3  # m: an answer as good as this is good
+RIGHT_MEAN_PX, RIGHT_TIP_PX = 1.0, 3.0  # px at the device: or as this, where pixels are coarse
 SILENT_MEAN, SILENT_TIP = 1e-3, 2e-3    # m: a published result farther off than this is a silent failure
 CHI2_95 = 7.815                         # 95 % of chi-squared with three degrees of freedom: what a 95 % ellipsoid holds
-ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,12 @@ class Answer:
     outcome: Outcome
     device: bool = True                 # whether both images show one
     errors: Errors | None = None
-    surprise: float = float('nan')      # squared Mahalanobis distance of the tip; see metrics.surprise
+    surprise: float = math.nan      # squared Mahalanobis distance of the tip; see metrics.surprise
     note: str = ''
     detail: str = ''                    # the reason in words
+    kind: str = ''                      # of device, where the family has several
+    px_m: float = math.nan              # m a pixel at the device, the mean of both planes
+    cpu_s: float = math.nan             # of the whole process, all its threads
 
     @property
     def published(self) -> bool:
@@ -47,6 +51,13 @@ class Answer:
     @property
     def within(self) -> bool:
         return self.errors is not None and self.errors.mean <= WITHIN_MEAN and self.errors.tip <= WITHIN_TIP
+
+    @property
+    def right(self) -> bool:
+        """`within`, or as near as pixels are fine."""
+        px = 0.0 if math.isnan(self.px_m) else self.px_m
+        return (self.errors is not None and self.errors.mean <= max(WITHIN_MEAN, RIGHT_MEAN_PX * px)
+                and self.errors.tip <= max(WITHIN_TIP, RIGHT_TIP_PX * px))
 
     @property
     def silent_failure(self) -> bool:
@@ -62,6 +73,10 @@ class Task:
     seed: int
     methods: tuple[str, ...]
     real: Path | None = None
+    sources: Sources | None = None      # of a family of `varied`
+    base: bool = True                   # whether the base's position is given
+    radius_error: float = 0.0           # the radius given is off by this share of the true one
+    picture: str = ''                   # which answers of the first method are worth a thumbnail, one of PICTURES; '': none
 
 
 @dataclass(frozen=True)
@@ -69,64 +84,65 @@ class Trial:
     """What came of a task."""
 
     task: Task
-    answers: dict[str, Answer]      # by method
-    bound: Bound | None             # where the family has one
+    answers: dict[str, Answer]              # by method
+    bound: Bound | None                     # where the family has one
+    thumbnail: np.ndarray | None = None     # uint8, the pair as a person sees it, where the task asks for it
+
+
+PICTURES: dict[str, Callable[[Answer], bool]] = {
+    'all': lambda a: True,
+    'answered': lambda a: a.published,
+    'refused': lambda a: not a.published,
+    'silent': lambda a: a.silent_failure,
+}
 
 
 def attempt(task: Task) -> Trial:
-    """Draw the scene of a task and let each method say what it sees."""
-    family = families(task.real)[task.family]
+    """Draw the scene of a task and let each method say what it sees. Raises ToolError where the scene can't be drawn.
+
+    A family of `varied` gets no bound: not all of its devices have both ends in both images.
+    """
+    family = family_of(task)
     try:
         case = family.make(task.seed)
-    except ValueError as error:
+    except (ValueError, ImportError) as error:      # ImportError: a renderer is missing here
         raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
-    answers = {method: answer(case, Config.from_values(method=method), family.device) for method in task.methods}
-    return Trial(task, answers, bound(case.run) if case.run else None)
+    try:
+        answers = {method: answer(case, Config.from_values(method=method), family.device, task.base, task.radius_error) for method in task.methods}
+    except ConfigError as error:    # a radius that no device has
+        raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
+    first = next(iter(answers.values()))
+    picture = thumbnail(case.scene.frame.images) if task.picture and PICTURES[task.picture](first) else None
+    return Trial(task, answers, bound(case.run) if case.run and task.sources is None else None, picture)
 
 
-def answer(case: Case, config: Config, device: bool = True) -> Answer:
-    """What the pipeline says of one scene. The device's radius and its base's position are given, as a robot's user would."""
+def family_of(task: Task) -> Family:
+    return (families(task.real) if task.sources is None else varied(task.sources))[task.family]
+
+
+def answer(case: Case, config: Config, device: bool = True, base: bool = True, radius_error: float = 0.0) -> Answer:
+    """What the pipeline says of one scene. The device's radius and its base's position are given, as a robot's user would.
+
+    The radius is off by a share `radius_error`; the base's position is kept back without `base`, and where a scene has none. Raises ConfigError.
+    """
     scene = case.scene
-    config = config.replace(robot_radius=scene.radius, base_position=scene.base_position.tolist())
-    return answer_of(case, reconstruct(scene.frame, config, Prior(masks=case.masks)), device)
+    config = config.replace(robot_radius=scene.radius * (1 + radius_error), base_position=scene.base_position.tolist() if base else [])
+    start = time.process_time()
+    result = reconstruct(scene.frame, config, Prior(masks=case.masks))
+    cpu_s = time.process_time() - start
+    return dataclasses.replace(answer_of(case, result, device), cpu_s=cpu_s)
 
 
 def answer_of(case: Case, result: Reconstruction, device: bool = True) -> Answer:
-    """How far off a result for a scene is."""
+    """How far off a result for a scene is. `device` False: it shows none, whatever the case says."""
     scene = case.scene
-    if result.shape is None or not device:
-        return Answer(scene.seed, result.outcome, device, note=case.note, detail=result.detail)
+    found = Answer(scene.seed, result.outcome, device and case.device, note=case.note, detail=result.detail, kind=case.kind, px_m=pixel_size(scene))
+    if result.shape is None or not found.device:
+        return found
     shape = result.shape
-    return Answer(scene.seed, result.outcome, device, compare(shape.points, scene.truth), surprise(shape.tip - scene.truth[-1], shape.covariance[-1]),
-                  case.note, result.detail)
+    return dataclasses.replace(found, errors=compare(shape.points, scene.truth), surprise=surprise(shape.tip - scene.truth[-1], shape.covariance[-1]))
 
 
-def attempts(tasks: Sequence[Task], jobs: int) -> Iterator[Trial]:
-    """The trials of all tasks in their order, made by `jobs` processes of one thread each: the same on any number of them.
-
-    Raises ToolError where a process dies, and whatever a scene raises (VTK may be missing).
-    """
-    with _one_thread_children(), ProcessPoolExecutor(min(jobs, len(tasks)), get_context('spawn'), _start_child) as pool:
-        try:
-            yield from pool.map(attempt, tasks)
-        except BrokenProcessPool as error:
-            raise ToolError('a process that tried scenes was ended from outside or crashed') from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextmanager
-def _one_thread_children():
-    """Processes started inside get libraries of one thread: these read the environment when they are loaded."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, '1'))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-def _start_child() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)    # Ctrl-C is the parent's to answer
-    cv2.setNumThreads(1)
+def pixel_size(scene: Scene) -> float:
+    """m a pixel at the device, the mean of both planes; NaN where no device is."""
+    return float(np.mean([1 / pixels_per_metre(v.P, scene.truth) for v in scene.frame.views])) if len(scene.truth) else math.nan
