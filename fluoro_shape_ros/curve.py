@@ -45,6 +45,18 @@ def curvature(points: np.ndarray) -> np.ndarray:
     return 2 * np.linalg.norm(np.cross(a, b), axis=1) / np.maximum(sides, 1e-30)
 
 
+def frames(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) tangents and (N, 3) normals, unit vectors, at (N, 3) points; the normals turn with the curve and not about it."""
+    tangents = np.gradient(points, arc_length(points), axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    normals = np.empty_like(tangents)
+    normal = np.eye(3)[np.abs(tangents[0]).argmin()]
+    for k, t in enumerate(tangents):    # carried from point to point: a frame is defined by its past
+        normal = normal - (normal @ t) * t
+        normals[k] = normal = normal / np.linalg.norm(normal)
+    return tangents, normals
+
+
 def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The median along an axis, of an even number the upper one of the middle two; several times as fast as NumPy's."""
     k = values.shape[axis] // 2

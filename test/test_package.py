@@ -50,7 +50,8 @@ def test_package_xml_and_setup_py_agree(manifest):
 
 
 def test_every_python_dependency_is_a_rosdep_dependency(manifest):
-    keys = {'numpy': 'python3-numpy', 'pyyaml': 'python3-yaml', 'scipy': 'python3-scipy', 'opencv-python-headless': 'python3-opencv', 'scikit-image': 'python3-skimage', 'tqdm': 'python3-tqdm'}
+    keys = {'numpy': 'python3-numpy', 'pyyaml': 'python3-yaml', 'scipy': 'python3-scipy', 'opencv-python-headless': 'python3-opencv', 'scikit-image': 'python3-skimage',
+            'tqdm': 'python3-tqdm'}
     required = {requirement.split('>')[0] for requirement in METADATA['install_requires']}
     assert required == set(keys)
     assert {keys[name] for name in required} <= {e.text for e in manifest.findall('exec_depend')}

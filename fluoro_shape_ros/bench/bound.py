@@ -29,7 +29,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 from scipy.special import ellipe
 
-from ..curve import arc_length
+from ..curve import arc_length, frames
 from ..geometry import project, projection_jacobian
 from ..sim.scenes import Run
 
@@ -54,7 +54,8 @@ def bound(run: Run, knot_spacing: float = KNOT_SPACING) -> Bound:
     if min(f.room(curve).min() for f in run.fields) < 0:
         raise ValueError('the bound is that of a device with both ends in both images')
     s = arc_length(curve)
-    tangent, normals = frames(curve)
+    tangent, first = frames(curve)
+    normals = np.stack([first, np.cross(tangent, first)], axis=2)
     basis = spline_basis(s, knot_spacing)
     covariance = np.linalg.inv(sum(information(run, i, curve, tangent, normals, basis) for i in (0, 1)))
     n = basis.shape[1]
@@ -96,18 +97,6 @@ def length_change(s: np.ndarray, tangent: np.ndarray, normals: np.ndarray, basis
     """(2 n + 2,) derivative of the length by each of the parameters of `information`."""
     kappa = np.einsum('si,sia->sa', np.gradient(tangent, s, axis=0), normals)
     return np.append(-np.einsum('sj,sa,s->ja', basis, kappa, np.gradient(s)), [-1.0, 1.0])
-
-
-def frames(curve: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) tangents and (N, 3, 2) normals n1, n2 of (N, 3) points; the normals turn with the curve and not about it."""
-    tangent = np.gradient(curve, arc_length(curve), axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    first = np.empty_like(tangent)
-    normal = np.eye(3)[np.abs(tangent[0]).argmin()]
-    for k, t in enumerate(tangent):     # carried from point to point: the frame is defined by its past
-        normal = normal - (normal @ t) * t
-        first[k] = normal = normal / np.linalg.norm(normal)
-    return tangent, np.stack([first, np.cross(tangent, first)], axis=2)
 
 
 def spline_basis(s: np.ndarray, spacing: float) -> np.ndarray:

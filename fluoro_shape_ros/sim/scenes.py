@@ -14,7 +14,7 @@ from ..data import Frame, View
 from ..device import REST, Device, Segment
 from ..geometry import project
 from . import anatomy as surroundings
-from . import carm, imaging, placement, shapes, vtk_scene, xray
+from . import carm, gvxr_scene, imaging, placement, shapes, vtk_scene, xray
 
 FRAME_ID = 'isocenter'
 LENGTHS = (0.067, 0.188)            # m (Burgner et al. 2011)
@@ -125,10 +125,7 @@ class Run:
 
     def _depth(self, whole: np.ndarray, view: View, energy_kev: float) -> np.ndarray:
         """(H, W) float32: the device's optical depth, by this run's renderer."""
-        if self.renderer == 'gvxr':
-            from . import gvxr_scene
-            return gvxr_scene.optical_depth(whole, self.device, view, energy_kev)
-        return xray.optical_depth(whole, self.device, view, energy_kev)
+        return (gvxr_scene if self.renderer == 'gvxr' else xray).optical_depth(whole, self.device, view, energy_kev)
 
     def said(self) -> str:
         """What was drawn for a run with `chains`, in a line."""

@@ -12,7 +12,9 @@ import sys
 import cv2
 import numpy as np
 
+from ..curve import arc_length, at_arc_length
 from ..data import View
+from ..device import Device
 from ..geometry import decompose
 from .carm import shadow_box
 
@@ -45,20 +47,35 @@ def degrade(image: np.ndarray, rng: np.random.Generator, variance: float = 0.002
 
 def coverage(backbone: np.ndarray, radius: float, view: View) -> np.ndarray:
     """(H, W) float32: the fraction of each pixel that the tube's shadow covers."""
+    return _covered([(backbone, radius)], shadow_box(view, backbone, radius), view)
+
+
+def device_coverage(backbone: np.ndarray, device: Device, view: View) -> np.ndarray:
+    """(H, W) float32: the fraction of each pixel that the outline of a device about the (N, 3) backbone, base to tip, covers. Errors: `render`."""
+    s = arc_length(backbone)
+    tubes = []
+    for piece in device.pieces(s[-1]):
+        start, stop = max(0.0, s[-1] - piece.stop), s[-1] - piece.start
+        at = np.concatenate([[start], s[(s > start) & (s < stop)], [stop]])
+        tubes.append((at_arc_length(backbone, at), piece.radius))
+    return _covered(tubes, shadow_box(view, backbone, device.widest), view)
+
+
+def _covered(tubes: list[tuple[np.ndarray, float]], box: tuple[np.ndarray, np.ndarray] | None, view: View) -> np.ndarray:
+    """(H, W) float32: the fraction of each pixel that tubes, (N, 3) points and a radius in m each, cover together; None for `box`: none is in sight."""
     image = np.zeros((view.height, view.width), np.float32)
-    box = shadow_box(view, backbone, radius)
     if box is None:
         return image
     low, high = box
     K, R, t = decompose(view.P)
     crop = np.array([[1.0, 0.0, -low[0]], [0.0, 1.0, -low[1]], [0.0, 0.0, 1.0]]) @ K
-    drawn = _draw(backbone @ R.T + t, radius, crop, high - low)
+    drawn = _draw([(points @ R.T + t, radius) for points, radius in tubes], crop, high - low)
     image[low[1]:high[1], low[0]:high[0]] = cv2.resize(drawn, tuple(int(n) for n in high - low), interpolation=cv2.INTER_AREA)
     return image
 
 
-def _draw(points: np.ndarray, radius: float, K: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(h, w) float32 in [0, 1]: the tube about (N, 3) points of the camera's frame (z along the beam), seen with intrinsics K.
+def _draw(tubes: list[tuple[np.ndarray, float]], K: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """(h, w) float32 in [0, 1]: tubes, (N, 3) points of the camera's frame (z along the beam) and a radius each, seen with intrinsics K.
 
     `size` is (w, h) in px of K; the image has SUPERSAMPLING times as many.
     """
@@ -70,9 +87,11 @@ def _draw(points: np.ndarray, radius: float, K: np.ndarray, size: np.ndarray) ->
     except ImportError as error:
         raise ImportError(f'the VTK renderer needs vtk, which is not installed here ({error}): pip install "fluoro_shape_ros[vtk]"') from error
     renderer = vtkRenderer()
-    renderer.AddActor(_tube(points * [1.0, -1.0, -1.0], radius))        # OpenGL: y up, looking along -z
+    for points, radius in tubes:
+        renderer.AddActor(_tube(points * [1.0, -1.0, -1.0], radius))        # OpenGL: y up, looking along -z
     w, h = (SUPERSAMPLING * int(n) for n in size)
-    near, far = points[:, 2].min() - 2 * radius, points[:, 2].max() + 2 * radius
+    near = min(points[:, 2].min() - 2 * radius for points, radius in tubes)
+    far = max(points[:, 2].max() + 2 * radius for points, radius in tubes)
     window = _offscreen_window()
     window.SetMultiSamples(0)
     window.SetSize(w, h)
