@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .curve import arc_length, distance_to, resample
+from .geometry.curve import arc_length, distance_to, resample
 
 DENSE = 0.05e-3     # m: both curves are sampled this finely
 

@@ -16,7 +16,7 @@ from msg_adapters.messages import ros_message
 from msg_adapters.shapes import shape_to_cloud, shape_to_path_cdr, shape_to_tip, shape_to_tip_pose
 
 from .data import Frame, Reconstruction
-from .geometry import isocenter
+from .geometry.cameras import isocenter
 from .overlay import overlay, words
 from .pairing import PLANES
 from .worker import Job, decode

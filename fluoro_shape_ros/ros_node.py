@@ -29,8 +29,8 @@ from .data import Frame, Outcome, Reconstruction
 from .limits import bounded
 from .outputs import Outputs
 from .pairing import PLANES, Pairer
-from .pipeline import reconstruct
-from .prior import newest
+from .method.pipeline import reconstruct
+from .method.prediction import newest
 from .subscriptions import Inputs, path_of, surviving
 from .transforms import TfMissing, TfPoses, import_tf
 from .waiting import CameraBook, Pair, WaitingRoom

@@ -19,7 +19,7 @@ from .config import Config
 from .data import Frame, Outcome, Prior, Reconstruction, Shape, View
 from .limits import Oversized
 from .pairing import PLANES
-from .prior import staleness
+from .method.prediction import staleness
 
 
 class NoTransform(LookupError):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from fluoro_shape_ros.data import Distortion, View
-from fluoro_shape_ros.geometry import GeometryError, make_view
+from fluoro_shape_ros.geometry.cameras import GeometryError, make_view
 
 from .messages import short
 

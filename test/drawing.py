@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from fluoro_shape_ros.geometry import make_view
+from fluoro_shape_ros.geometry.cameras import make_view
 from fluoro_shape_ros.sim import xray
 from msg_adapters.calibration import Calibration
 

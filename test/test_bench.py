@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome, Reconstruction, Shape
-from fluoro_shape_ros.geometry import decompose, project, source
+from fluoro_shape_ros.geometry.cameras import decompose, project, source
 from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.sim import carm, scenes
 from fluoro_shape_ros.bench import composites, families, main, speed, table, trial

@@ -6,16 +6,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 
-from fluoro_shape_ros.beside import without_neighbours
+from fluoro_shape_ros.method.fit.neighbours import without_neighbours
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Frame, Outcome
-from fluoro_shape_ros.fit import fit
-from fluoro_shape_ros.hop import darkest_path, other_lines
-from fluoro_shape_ros.pipeline import reconstruct
-from fluoro_shape_ros.profiles import WIDTHS, likeness, mean_profile, shadow
+from fluoro_shape_ros.method.fit.fit import fit
+from fluoro_shape_ros.method.propose.other_lines import darkest_path, other_lines
+from fluoro_shape_ros.method.pipeline import reconstruct
+from fluoro_shape_ros.imaging.profiles import WIDTHS, likeness, mean_profile, shadow
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.xray import Exposure, transmission
-from fluoro_shape_ros.strips import Model, Sheet, Strips, measure
+from fluoro_shape_ros.imaging.strips import Model, Sheet, Strips, measure
 
 HALF_WIDTH, REACH = 2.0, 9.0        # px
 ALL = np.ones(120, bool)

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from fluoro_shape_ros.curve import arc_length, frames
+from fluoro_shape_ros.geometry.curve import arc_length, frames
 from fluoro_shape_ros.sim import carm, placement, scenes, shapes, xray
 from fluoro_shape_ros.bench import bound
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from fluoro_shape_ros.geometry import decompose, project, source
+from fluoro_shape_ros.geometry.cameras import decompose, project, source
 from fluoro_shape_ros.sim import carm
 from fluoro_shape_ros.tools import calibrate
 from fluoro_shape_ros.tools.calibrate import CalibrationError, pose_arguments, projection_from_points, read_beads, residuals_px

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.geometry import distort, project, undistort
+from fluoro_shape_ros.geometry.cameras import distort, project, undistort
 from msg_adapters.cameras import BadCameraInfo, camera_info_to_view, check_lengths
 from msg_adapters.messages import header
 

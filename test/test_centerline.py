@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.centerline import find_ridges, ridge_scale
-from fluoro_shape_ros.chains import find_candidates
+from fluoro_shape_ros.imaging.ridges import find_ridges, ridge_scale
+from fluoro_shape_ros.imaging.lines import find_candidates
 
 V, U = np.mgrid[0:200, 0:240].astype(float)
 FIELD = np.full(U.shape, 255, np.uint8)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.curve import arc_length, at_arc_length, curvature, distance_to, even_steps, resample
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length, curvature, distance_to, even_steps, resample
 
 
 def circle(radius, angle, n):

@@ -7,19 +7,19 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
-from fluoro_shape_ros.chains import Candidate
-from fluoro_shape_ros.curve import arc_length, at_arc_length
+from fluoro_shape_ros.imaging.lines import Candidate
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome, Prior
-from fluoro_shape_ros.detect import candidates_of, detect, explained, track
-from fluoro_shape_ros.field import field_of_view
-from fluoro_shape_ros.geometry import project
-from fluoro_shape_ros.plausibility import evidence
-from fluoro_shape_ros.pipeline import reconstruct
-from fluoro_shape_ros.prior import look
+from fluoro_shape_ros.method.detect import candidates_of, detect, explained, track
+from fluoro_shape_ros.imaging.field import field_of_view
+from fluoro_shape_ros.geometry.cameras import project
+from fluoro_shape_ros.method.plausibility import evidence
+from fluoro_shape_ros.method.pipeline import reconstruct
+from fluoro_shape_ros.method.prediction import look
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
-from fluoro_shape_ros.strips import Sheet
+from fluoro_shape_ros.imaging.strips import Sheet
 from fluoro_shape_ros.bench.families import families
 
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
@@ -114,7 +114,7 @@ def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, monk
         return [Candidate(line, np.ones(len(line)), 0.9)]
 
     sheet = prepared(scene.frame)
-    monkeypatch.setattr('fluoro_shape_ros.detect.candidates_of', mixed)
+    monkeypatch.setattr('fluoro_shape_ros.method.detect.candidates_of', mixed)
     result = detect(sheet, RADIUS, MIN_LENGTH)
     assert result.outcome is Outcome.OK and mean_off(result.fit, scene.truth) < 0.08e-3
     ends = result.fit.spline(np.array([result.fit.start, result.fit.stop]))
@@ -142,7 +142,7 @@ def test_tracking_gives_up_where_the_device_is_not(run, scene):
     (dict(likeness=np.array([0.5, 0.5])), None),
 ])
 def test_a_tracked_fit_in_doubt_wants_the_whole_images_searched(scene, found, monkeypatch, other, sure):
-    monkeypatch.setattr('fluoro_shape_ros.detect.fit', lambda *_: replace(found.fit, **dict(aside=np.zeros((2, 2))) | other))
+    monkeypatch.setattr('fluoro_shape_ros.method.detect.fit', lambda *_: replace(found.fit, **dict(aside=np.zeros((2, 2))) | other))
     tracked = track(prepared(scene.frame), RADIUS, 60.0, scene.truth)
     assert (None if tracked is None else tracked.sure) is sure
 
@@ -151,7 +151,7 @@ def test_a_lead_counts_by_what_speaks_for_it_but_less_than_what_lines_led_to(sce
     better = replace(found.fit, likeness=np.ones(2))
     sheet = prepared(scene.frame)
     assert detect(sheet, RADIUS, MIN_LENGTH, leads=[better]).fit is not better
-    monkeypatch.setattr('fluoro_shape_ros.detect.UNASKED', 1.0)
+    monkeypatch.setattr('fluoro_shape_ros.method.detect.UNASKED', 1.0)
     result = detect(sheet, RADIUS, MIN_LENGTH, leads=[replace(better, likeness=np.full(2, 0.9)), better])
     assert result.fit is better
     for seen, before in zip(result.seen_px, found.seen_px):
@@ -159,8 +159,8 @@ def test_a_lead_counts_by_what_speaks_for_it_but_less_than_what_lines_led_to(sce
 
 
 def test_where_no_lines_belong_together_a_prediction_leads_to_the_device(scene, monkeypatch):
-    monkeypatch.setattr('fluoro_shape_ros.detect._pairs', lambda *_: iter(()))
-    monkeypatch.setattr('fluoro_shape_ros.detect.sweep', lambda *_: None)
+    monkeypatch.setattr('fluoro_shape_ros.method.detect._pairs', lambda *_: iter(()))
+    monkeypatch.setattr('fluoro_shape_ros.method.detect.sweep', lambda *_: None)
     sheet, bent = prepared(scene.frame), scene.truth + [[0, 0, 0.004]] * np.linspace(0, 1, len(scene.truth))[:, None] ** 2
     assert detect(sheet, RADIUS, MIN_LENGTH).outcome is Outcome.NO_CORRESPONDENCE
     result = detect(sheet, RADIUS, MIN_LENGTH, look(Prior(predicted=bent), VIEWS, 0.01)[0])

@@ -19,7 +19,7 @@ from pydicom.uid import JPEGBaseline8Bit, RLELossless                     # noqa
 from scipy.spatial import cKDTree                                           # noqa: E402
 from xa import PERSON, SID, SOD, logarithms, make                           # noqa: E402
 
-from fluoro_shape_ros.geometry import project, source                       # noqa: E402
+from fluoro_shape_ros.geometry.cameras import project, source                       # noqa: E402
 from fluoro_shape_ros.tools import dicom, dicom_pixels, importer, replay    # noqa: E402
 from msg_adapters.bags import open_bag                                      # noqa: E402
 from msg_adapters.images import image_to_array                              # noqa: E402

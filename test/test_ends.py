@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.ends import tip_is_last
+from fluoro_shape_ros.method.tip import tip_is_last
 
 ENDS = np.array([[0.0, 0, 0], [0.1, 0, 0]])
 INSIDE = np.array([[100.0, 100], [200, 200]])       # px from the border: the last end is farther inside

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.special import ndtr
 
-from fluoro_shape_ros.extent import bulge, locate, supported
+from fluoro_shape_ros.method.fit.ends import bulge, locate, supported
 
 PX = 1 / 3000.0                                             # m a pixel
 S = np.arange(200) * PX

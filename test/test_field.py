@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.field import border_distance, field_of_view
+from fluoro_shape_ros.imaging.field import border_distance, field_of_view
 
 
 def test_a_plain_image_is_all_field():

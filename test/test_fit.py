@@ -8,15 +8,15 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
-from fluoro_shape_ros.curve import arc_length, at_arc_length
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Frame
-from fluoro_shape_ros.field import field_of_view
-from fluoro_shape_ros.fit import fit, shown
-from fluoro_shape_ros.geometry import source
+from fluoro_shape_ros.imaging.field import field_of_view
+from fluoro_shape_ros.method.fit.fit import fit, shown
+from fluoro_shape_ros.geometry.cameras import source
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.xray import Exposure, transmission
-from fluoro_shape_ros.strips import Sheet
+from fluoro_shape_ros.imaging.strips import Sheet
 
 PX = 0.3e-3
 VIEWS = biplane(arm=CArm(pixel_size_iso=PX, width=512, height=512))

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry import (GeometryError, calibration_covariance, check_pair, check_scale, crop, decompose, depth, distort, epipolar_lines, fundamental,
+from fluoro_shape_ros.geometry.cameras import (GeometryError, calibration_covariance, check_pair, check_scale, crop, decompose, depth, distort, epipolar_lines, fundamental,
                                        isocenter, make_view, pixels_per_metre, plane_angle, project, projection_jacobian, source, triangulate, undistort)
 
 K = np.array([[1000.0, 0, 50], [0, 1000.0, 40], [0, 0, 1]])

@@ -12,8 +12,8 @@ pytest.importorskip('yaml')
 
 from drawing import CALIBRATIONS, GOOD, RADIUS, SIZE                            # noqa: E402
 
-from fluoro_shape_ros.tools import importer, replay                     # noqa: E402
-from fluoro_shape_ros.tools.cli import ToolError                        # noqa: E402
+from fluoro_shape_ros.tools import importer, replay    # noqa: E402
+from fluoro_shape_ros.tools.cli import ToolError    # noqa: E402
 from msg_adapters.bags import open_bag                                  # noqa: E402
 from msg_adapters.calibration import Calibration, write_calibration     # noqa: E402
 from msg_adapters.images import image_to_array                          # noqa: E402

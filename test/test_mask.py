@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome, Prior
-from fluoro_shape_ros.mask import shift_between, subtract
-from fluoro_shape_ros.pipeline import reconstruct
+from fluoro_shape_ros.imaging.mask import shift_between, subtract
+from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.sim.anatomy import anatomy
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.curve import arc_length, at_arc_length
-from fluoro_shape_ros.geometry import fundamental, project
-from fluoro_shape_ros.matching import align
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
+from fluoro_shape_ros.geometry.cameras import fundamental, project
+from fluoro_shape_ros.method.propose.alignment import align
 from fluoro_shape_ros.sim.carm import CArm, biplane
 
 PX = 0.3e-3                                     # m at the isocentre

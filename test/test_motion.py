@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluoro_shape_ros.data import Prior, Shape
-from fluoro_shape_ros.motion import going_on
+from fluoro_shape_ros.method.propose.motion import going_on
 
 STEP = 10**9 // 15      # ns
 

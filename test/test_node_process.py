@@ -39,7 +39,7 @@ def test_a_signal_in_the_middle_of_a_pair(log, number):
     """A pair that never ends: the worker's thread can't be joined."""
     code = """if True:
         import sys, threading
-        import fluoro_shape_ros.pipeline as pipeline
+        import fluoro_shape_ros.method.pipeline as pipeline
         from fluoro_shape_ros.node import main
         pipeline.reconstruct = lambda *_: print('at work', flush=True) or threading.Event().wait()
         sys.exit(main())"""
@@ -52,7 +52,7 @@ def test_a_signal_in_the_middle_of_a_pair(log, number):
 def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
     code = """if True:
         import sys
-        import fluoro_shape_ros.pipeline as pipeline
+        import fluoro_shape_ros.method.pipeline as pipeline
         from fluoro_shape_ros.node import main
         real, left = pipeline.reconstruct, [0, 0]
         def buggy(*arguments):
@@ -126,7 +126,7 @@ def test_parameter_files_that_are_installed(tmp_path):
 def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log):
     code = """if True:
         import sys, threading
-        import fluoro_shape_ros.pipeline as pipeline
+        import fluoro_shape_ros.method.pipeline as pipeline
         from fluoro_shape_ros import ros_node
         from fluoro_shape_ros.node import main
         ros_node.OVERDUE_S = 1.0

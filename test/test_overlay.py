@@ -8,7 +8,7 @@ import pytest
 
 from fluoro_shape_ros import overlay as o
 from fluoro_shape_ros.data import Centerline, Distortion, Outcome, Reconstruction, Shape
-from fluoro_shape_ros.geometry import distort, make_view, project
+from fluoro_shape_ros.geometry.cameras import distort, make_view, project
 
 SIZE = 512
 K = np.array([[1000.0, 0, 255.5], [0, 1000.0, 255.5], [0, 0, 1]])

@@ -156,7 +156,7 @@ def python(code, *arguments):
     return subprocess.run([sys.executable, '-c', code, *arguments], capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.parametrize('module', ['fluoro_shape_ros.pipeline', 'fluoro_shape_ros.sim.scenes', 'msg_adapters.images', 'msg_adapters.shapes', 'msg_adapters.bags',
+@pytest.mark.parametrize('module', ['fluoro_shape_ros.method.pipeline', 'fluoro_shape_ros.sim.scenes', 'msg_adapters.images', 'msg_adapters.shapes', 'msg_adapters.bags',
                                     *sorted(EXECUTABLES.values())])
 def test_imports_without_ros(module):
     done = python(f'{WITHOUT_ROS}\nimport importlib, sys\nimportlib.import_module(sys.argv[1])', module)

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.signal import wiener as scipy_wiener
 
-from fluoro_shape_ros import paper
-from fluoro_shape_ros.geometry import make_view, project
+from fluoro_shape_ros.method import paper
+from fluoro_shape_ros.geometry.cameras import make_view, project
 
 K = np.array([[1000.0, 0, 128], [0, 1000.0, 128], [0, 0, 1]])
 A = make_view('a', K @ np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]]), 257, 257)

@@ -9,8 +9,8 @@ from rcl_interfaces.msg import ParameterType        # noqa: E402
 from rclpy.context import Context                   # noqa: E402
 from rclpy.parameter import Parameter               # noqa: E402
 
-from fluoro_shape_ros import params                 # noqa: E402
-from fluoro_shape_ros.config import Config, ConfigError, fields     # noqa: E402
+from fluoro_shape_ros import params    # noqa: E402
+from fluoro_shape_ros.config import Config, ConfigError, fields    # noqa: E402
 
 
 @pytest.fixture(scope='module')

@@ -10,16 +10,16 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.config import Config
-from fluoro_shape_ros.curve import arc_length, at_arc_length
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Distortion, Frame, Outcome, Prior, Shape
-from fluoro_shape_ros.field import field_of_view
-from fluoro_shape_ros.fit import fit
-from fluoro_shape_ros.geometry import calibration_covariance, decompose, make_view, undistort
-from fluoro_shape_ros.pipeline import backbone, reconstruct
+from fluoro_shape_ros.imaging.field import field_of_view
+from fluoro_shape_ros.method.fit.fit import fit
+from fluoro_shape_ros.geometry.cameras import calibration_covariance, decompose, make_view, undistort
+from fluoro_shape_ros.method.pipeline import backbone, reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.xray import Exposure
-from fluoro_shape_ros.strips import Sheet
+from fluoro_shape_ros.imaging.strips import Sheet
 
 SIZE = 512
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))

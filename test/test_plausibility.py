@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
-from fluoro_shape_ros.fit import Fit, contrast_ratio, shown
-from fluoro_shape_ros.pipeline import CALIBRATION_PX, reconstruct
-from fluoro_shape_ros.plausibility import (blunt, check_curvature, check_length, check_reprojection, check_tip, clear, curvature_limit, doubt,
+from fluoro_shape_ros.method.fit.fit import Fit, contrast_ratio, shown
+from fluoro_shape_ros.method.pipeline import CALIBRATION_PX, reconstruct
+from fluoro_shape_ros.method.plausibility import (blunt, check_curvature, check_length, check_reprojection, check_tip, clear, curvature_limit, doubt,
                                            evidence)
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
-from fluoro_shape_ros.spline import Spline3
+from fluoro_shape_ros.geometry.spline import Spline3
 
 ARC = 0.05 * np.c_[np.cos(np.linspace(0, 1, 9)), np.sin(np.linspace(0, 1, 9)), np.zeros(9)]     # 20 /m
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fluoro_shape_ros import prior
+from fluoro_shape_ros.method import prediction as prior
 from fluoro_shape_ros.config import Config, ConfigError
 from fluoro_shape_ros.data import Outcome, Prior
-from fluoro_shape_ros.fit import Fit
+from fluoro_shape_ros.method.fit.fit import Fit
 from fluoro_shape_ros.metrics import Errors
-from fluoro_shape_ros.pipeline import reconstruct
+from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
-from fluoro_shape_ros.spline import Spline3
+from fluoro_shape_ros.geometry.spline import Spline3
 from fluoro_shape_ros.bench import prediction
 from fluoro_shape_ros.bench.prediction import Try, predictions, pushed
 from fluoro_shape_ros.bench.families import families
@@ -157,7 +157,7 @@ def test_a_pushed_robot_is_measured_where_it_is_without_a_search(scene, config, 
 
 def test_tracking_that_the_prediction_contradicts_gives_way_to_it(scene, config, answer, good, monkeypatch):
     """Say tracking held on to the first half of the device only."""
-    import fluoro_shape_ros.pipeline as pipeline
+    import fluoro_shape_ros.method.pipeline as pipeline
     real = pipeline.track
 
     def half(*arguments):

@@ -16,11 +16,11 @@ from generated import examples                          # noqa: E402
 from hypothesis import example, given                   # noqa: E402
 from hypothesis import strategies as st                     # noqa: E402
 
-from fluoro_shape_ros.config import Config                  # noqa: E402
-from fluoro_shape_ros.data import Frame, Outcome            # noqa: E402
-from fluoro_shape_ros.geometry import GeometryError, check_pair     # noqa: E402
-from fluoro_shape_ros.pipeline import reconstruct           # noqa: E402
-from fluoro_shape_ros.worker import camera, checked_camera  # noqa: E402
+from fluoro_shape_ros.config import Config    # noqa: E402
+from fluoro_shape_ros.data import Frame, Outcome    # noqa: E402
+from fluoro_shape_ros.geometry.cameras import GeometryError, check_pair     # noqa: E402
+from fluoro_shape_ros.method.pipeline import reconstruct           # noqa: E402
+from fluoro_shape_ros.worker import camera, checked_camera    # noqa: E402
 from msg_adapters.cameras import BadCameraInfo, camera_info_to_view     # noqa: E402
 from msg_adapters.images import ENCODINGS, BadImage, compressed_to_array, image_to_array    # noqa: E402
 from msg_adapters.shapes import BadPath, path_to_points     # noqa: E402

@@ -11,7 +11,7 @@ from hypothesis import strategies as st         # noqa: E402
 from scipy.spatial.transform import Rotation    # noqa: E402
 
 from fluoro_shape_ros.data import Distortion    # noqa: E402
-from fluoro_shape_ros.geometry import (GeometryError, check_pair, decompose, depth, distort, epipolar_lines, fundamental, make_view, plane_angle,   # noqa: E402
+from fluoro_shape_ros.geometry.cameras import (GeometryError, check_pair, decompose, depth, distort, epipolar_lines, fundamental, make_view, plane_angle,   # noqa: E402
                                        project, projection_jacobian, source, triangulate, undistort)
 
 SIZE = 1024

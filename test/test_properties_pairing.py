@@ -8,9 +8,9 @@ from generated import examples                  # noqa: E402
 from hypothesis import given                    # noqa: E402
 from hypothesis import strategies as st         # noqa: E402
 
-from fluoro_shape_ros.pairing import BUFFER, JUMP_NS, LAST_NS, PLANES, Pairer       # noqa: E402
-from fluoro_shape_ros.waiting import BUFFER as ROOM     # noqa: E402
-from fluoro_shape_ros.waiting import PATIENCE_S, CameraBook, Pair, WaitingRoom      # noqa: E402
+from fluoro_shape_ros.pairing import BUFFER, JUMP_NS, LAST_NS, PLANES, Pairer    # noqa: E402
+from fluoro_shape_ros.waiting import BUFFER as ROOM    # noqa: E402
+from fluoro_shape_ros.waiting import PATIENCE_S, CameraBook, Pair, WaitingRoom    # noqa: E402
 
 MS = 1_000_000
 T0 = 10**12

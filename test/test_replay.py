@@ -15,9 +15,9 @@ from drawing import BASE, BLANK, CALIBRATIONS, GOOD, TOLERANCE, curve           
 from recording import IMAGE, INFO, RADIUS, SECOND, SKEW, main, outcomes, read, record               # noqa: E402
 from scipy.spatial import cKDTree                                       # noqa: E402
 
-from fluoro_shape_ros.config import Config, ConfigError                 # noqa: E402
-from fluoro_shape_ros.tools import offline                               # noqa: E402
-from fluoro_shape_ros.tools.parameters import read_parameters           # noqa: E402
+from fluoro_shape_ros.config import Config, ConfigError    # noqa: E402
+from fluoro_shape_ros.tools import offline    # noqa: E402
+from fluoro_shape_ros.tools.parameters import read_parameters    # noqa: E402
 from msg_adapters.bags import create_bag, open_bag                      # noqa: E402
 from msg_adapters.calibration import calibration_to_camera_info         # noqa: E402
 from msg_adapters.images import array_to_image                          # noqa: E402

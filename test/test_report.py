@@ -16,11 +16,11 @@ from drawing import BASE, BLANK, GOOD, curve                            # noqa: 
 from recording import main, record                                      # noqa: E402
 from scipy.spatial import cKDTree                                       # noqa: E402
 
-from fluoro_shape_ros.config import Config                              # noqa: E402
-from fluoro_shape_ros.data import Outcome, Reconstruction, Shape        # noqa: E402
-from fluoro_shape_ros.tools import history, report                      # noqa: E402
-from fluoro_shape_ros.tools.offline import Answer, Summary              # noqa: E402
-from fluoro_shape_ros.worker import Job                                 # noqa: E402
+from fluoro_shape_ros.config import Config    # noqa: E402
+from fluoro_shape_ros.data import Outcome, Reconstruction, Shape    # noqa: E402
+from fluoro_shape_ros.tools import history, report    # noqa: E402
+from fluoro_shape_ros.tools.offline import Answer, Summary    # noqa: E402
+from fluoro_shape_ros.worker import Job    # noqa: E402
 
 NAME = 'run<img src=x onerror=alert(1)>'        # of a bag; must stay a name
 UP_PX = 8                                       # v of both planes is -z: 1 mm a pixel at the origin

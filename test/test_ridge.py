@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.ridge import eigenvalues, hessian
+from fluoro_shape_ros.imaging.hessian import eigenvalues, hessian
 
 V, U = np.mgrid[0:41, 0:41].astype(np.float32) - 20
 

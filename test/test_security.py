@@ -14,7 +14,7 @@ from nav_msgs.msg import Path                       # noqa: E402
 from rclpy.serialization import serialize_message   # noqa: E402
 from ros_client import BASE, GOOD, VIEWS, image_msg, info_msg     # noqa: E402
 
-from fluoro_shape_ros.resources import resource_path        # noqa: E402
+from fluoro_shape_ros.resources import resource_path    # noqa: E402
 
 LIMIT = 60.0        # s, for whatever must happen: the machine may be busy
 MOST_MB = 2000      # of resident memory, ever: some of the largest images that may come, being received

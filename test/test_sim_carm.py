@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.geometry import decompose, isocenter, pixels_per_metre, plane_angle, project, source
+from fluoro_shape_ros.geometry.cameras import decompose, isocenter, pixels_per_metre, plane_angle, project, source
 from fluoro_shape_ros.sim import carm
 
 ARM = carm.CArm(sid=1.2, sod=0.8, pixel_size_iso=0.4e-3, width=801, height=601)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.device import ENERGIES_KEV, WATER
-from fluoro_shape_ros.geometry import make_view, project, source
+from fluoro_shape_ros.geometry.cameras import make_view, project, source
 from fluoro_shape_ros.sim import carm, ct
 
 SMALL = carm.CArm(pixel_size_iso=1e-3, width=200, height=160)

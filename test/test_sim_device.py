@@ -5,9 +5,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.curve import arc_length, at_arc_length
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.device import REFERENCE_KEV, REST, Device, DeviceError, Ring, Segment, attenuation, load_device, presets
-from fluoro_shape_ros.geometry import project, source
+from fluoro_shape_ros.geometry.cameras import project, source
 from fluoro_shape_ros.sim import carm, xray
 
 PIXEL = 0.2e-3

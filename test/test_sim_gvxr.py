@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.curve import arc_length
+from fluoro_shape_ros.geometry.curve import arc_length
 from fluoro_shape_ros.device import REST, Device, Segment, attenuation, load_device
-from fluoro_shape_ros.geometry import decompose, make_view, project, source
+from fluoro_shape_ros.geometry.cameras import decompose, make_view, project, source
 from fluoro_shape_ros.sim import carm, gvxr_scene, mesh, vtk_scene, xray
 
 KEV = 60.0

@@ -20,10 +20,10 @@ from rclpy.executors import SingleThreadedExecutor          # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy         # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image               # noqa: E402
 
-from fluoro_shape_ros.curve import arc_length               # noqa: E402
-from fluoro_shape_ros.sim import carm, publisher, scenes, xray      # noqa: E402
-from fluoro_shape_ros.sim.publisher import FluoroSim, RosArgumentsError     # noqa: E402
-from fluoro_shape_ros.tools import sim as tool              # noqa: E402
+from fluoro_shape_ros.geometry.curve import arc_length               # noqa: E402
+from fluoro_shape_ros.sim import carm, publisher, scenes, xray    # noqa: E402
+from fluoro_shape_ros.sim.publisher import FluoroSim, RosArgumentsError    # noqa: E402
+from fluoro_shape_ros.tools import sim as tool    # noqa: E402
 from msg_adapters.cameras import camera_info_to_view        # noqa: E402
 from msg_adapters.images import image_to_array              # noqa: E402
 from msg_adapters.messages import stamp_ns                  # noqa: E402

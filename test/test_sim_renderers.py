@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.curve import arc_length
-from fluoro_shape_ros.geometry import project, source
+from fluoro_shape_ros.geometry.curve import arc_length
+from fluoro_shape_ros.geometry.cameras import project, source
 from fluoro_shape_ros.sim import carm, shapes, vtk_scene, xray
 
 FINE = carm.biplane(arm=carm.CArm(pixel_size_iso=0.2e-3, width=400, height=300))

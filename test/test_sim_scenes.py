@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.geometry import pixels_per_metre, plane_angle, project, source
+from fluoro_shape_ros.geometry.cameras import pixels_per_metre, plane_angle, project, source
 from fluoro_shape_ros.sim import anatomy, carm, placement, scenes, shapes, xray
 
 SMALL = carm.biplane(arm=carm.CArm(pixel_size_iso=1e-3, width=320, height=320))

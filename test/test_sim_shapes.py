@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluoro_shape_ros.curve import arc_length, curvature
+from fluoro_shape_ros.geometry.curve import arc_length, curvature
 from fluoro_shape_ros.sim import shapes
 from fluoro_shape_ros.sim.shapes import Cannula, Pose, Spline
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fluoro_shape_ros.curve import arc_length
+from fluoro_shape_ros.geometry.curve import arc_length
 from fluoro_shape_ros.device import presets
-from fluoro_shape_ros.geometry import pixels_per_metre, plane_angle, project
+from fluoro_shape_ros.geometry.cameras import pixels_per_metre, plane_angle, project
 from fluoro_shape_ros.sim import carm, ct, imaging, scenes, variety
 
 SMALL = carm.biplane(arm=carm.CArm(pixel_size_iso=0.6e-3, width=320, height=320))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.spline import Spline3, bending, prolong, through
+from fluoro_shape_ros.geometry.spline import Spline3, bending, prolong, through
 
 END = np.array([0.06, 0.03, 0.02])
 LENGTH = float(np.linalg.norm(END))                 # 0.07 m

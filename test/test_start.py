@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fluoro_shape_ros.curve import arc_length, at_arc_length
-from fluoro_shape_ros.geometry import fundamental, project
-from fluoro_shape_ros.matching import align
+from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
+from fluoro_shape_ros.geometry.cameras import fundamental, project
+from fluoro_shape_ros.method.propose.alignment import align
 from fluoro_shape_ros.sim.carm import CArm, biplane
-from fluoro_shape_ros.start import first_curve
+from fluoro_shape_ros.method.propose.first_curve import first_curve
 
 PX = 0.3e-3
 ARM = CArm(pixel_size_iso=PX, width=512, height=512)

@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import ndtr
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry import decompose, project, undistort
+from fluoro_shape_ros.geometry.cameras import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
-from fluoro_shape_ros.profiles import (WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces,
+from fluoro_shape_ros.imaging.profiles import (WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces,
                                        shadow, straight_on)
-from fluoro_shape_ros.strips import FOUND_PX, Measurement, Model, Sheet, Strips, cut, cut_along, half_width_range, measure, search
+from fluoro_shape_ros.imaging.strips import FOUND_PX, Measurement, Model, Sheet, Strips, cut, cut_along, half_width_range, measure, search
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre

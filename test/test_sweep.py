@@ -5,11 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
-from fluoro_shape_ros.field import field_of_view
-from fluoro_shape_ros.geometry import project, source
+from fluoro_shape_ros.imaging.field import field_of_view
+from fluoro_shape_ros.geometry.cameras import project, source
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
-from fluoro_shape_ros.sweep import BEND_COST, _expected, darkness, most_probable, sweep
+from fluoro_shape_ros.method.propose.sweep import BEND_COST, _expected, darkness, most_probable, sweep
 
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512))
 HALF_WIDTH = 2.0        # px

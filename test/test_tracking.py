@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Prior
-from fluoro_shape_ros.pipeline import reconstruct
+from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.shapes import posed

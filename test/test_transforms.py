@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
-from fluoro_shape_ros.geometry import decompose
+from fluoro_shape_ros.geometry.cameras import decompose
 from fluoro_shape_ros.pairing import PLANES
 from fluoro_shape_ros.resources import resource_path
 from fluoro_shape_ros.sim import carm

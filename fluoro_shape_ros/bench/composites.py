@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from ..data import Frame, View
-from ..field import field_of_view
-from ..geometry import GeometryError, isocenter, make_view
+from ..imaging.field import field_of_view
+from ..geometry.cameras import GeometryError, isocenter, make_view
 from ..sim import placement, xray
 from ..sim.scenes import FRAME_ID, Scene
 from ..tools.cli import ToolError

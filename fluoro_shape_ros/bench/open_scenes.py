@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from ..data import Frame
-from ..geometry import GeometryError, make_view
+from ..geometry.cameras import GeometryError, make_view
 from ..sim.scenes import FRAME_ID, Scene
 from ..tools.cli import ToolError
 from .case import Case, Family

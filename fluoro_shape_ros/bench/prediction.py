@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from ..config import Config
-from ..curve import arc_length
+from ..geometry.curve import arc_length
 from ..data import Prior, Reconstruction
 from ..metrics import compare
-from ..pipeline import reconstruct
+from ..method.pipeline import reconstruct
 from ..sim.kinematics import loaded
 from ..sim.shapes import random_cannula
 from .families import Case, families

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from ..config import Config
 from ..data import Prior, Reconstruction
 from ..metrics import compare
-from ..pipeline import reconstruct
+from ..method.pipeline import reconstruct
 from ..sim.carm import CArm, biplane
 from ..sim.scenes import Scene, xray_run
 from ..sim.xray import Exposure

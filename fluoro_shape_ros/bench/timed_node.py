@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 import time
 
-from .. import node, pipeline
+from .. import node
+from ..method import pipeline
 
 
 def main(argv: list[str]) -> int:

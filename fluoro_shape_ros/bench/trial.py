@@ -13,9 +13,9 @@ import numpy as np
 
 from ..config import Config, ConfigError
 from ..data import Outcome, Prior, Reconstruction
-from ..geometry import pixels_per_metre
+from ..geometry.cameras import pixels_per_metre
 from ..metrics import Errors, compare, surprise
-from ..pipeline import reconstruct
+from ..method.pipeline import reconstruct
 from ..sim.scenes import Scene
 from ..tools.cli import ToolError
 from .bound import Bound, bound

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..data import View
-from ..geometry import decompose, depth, make_view, project
+from ..geometry.cameras import decompose, depth, make_view, project
 
 
 @dataclass(frozen=True)

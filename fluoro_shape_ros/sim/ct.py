@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from ..data import View
 from ..device import ENERGIES_KEV, WATER
-from ..geometry import pixels_per_metre, source
+from ..geometry.cameras import pixels_per_metre, source
 
 BONE = np.array([0.6655, 0.4242, 0.3148, 0.2229, 0.1855])   # cm^2/g at ENERGIES_KEV: cortical bone of ICRU-44 (NIST)
 BONE_DENSITY = 1.92                 # g/cm^3, of the same

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..data import View
 from ..device import Device, attenuation, water_attenuation
-from ..geometry import decompose
+from ..geometry.cameras import decompose
 from . import mesh
 from .carm import shadow_box
 

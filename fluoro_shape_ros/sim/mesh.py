@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..curve import arc_length, frames
+from ..geometry.curve import arc_length, frames
 from ..device import Device
 
 SIDES = 64      # of a tube; its cross-section has the circle's area, its width is off by at most 0.08 %

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..data import View
-from ..geometry import epipolar_lines, fundamental, project, source
+from ..geometry.cameras import epipolar_lines, fundamental, project, source
 from . import shapes
 
 MARGIN_PX = 40                          # between the device and the field's border

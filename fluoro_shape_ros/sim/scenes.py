@@ -12,7 +12,7 @@ import numpy as np
 
 from ..data import Frame, View
 from ..device import REST, Device, Segment
-from ..geometry import project
+from ..geometry.cameras import project
 from . import anatomy as surroundings
 from . import carm, gvxr_scene, imaging, placement, shapes, vtk_scene, xray
 

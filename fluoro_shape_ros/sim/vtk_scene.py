@@ -12,10 +12,10 @@ import sys
 import cv2
 import numpy as np
 
-from ..curve import arc_length, at_arc_length
+from ..geometry.curve import arc_length, at_arc_length
 from ..data import View
 from ..device import Device
-from ..geometry import decompose
+from ..geometry.cameras import decompose
 from .carm import shadow_box
 
 SIDES = 32          # of the tube: its mean width is 0.3 % below the circle's

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters.calibration import Calibration, write_calibration
 
-from ..geometry import GeometryError, decompose, depth, make_view, project, source
+from ..geometry.cameras import GeometryError, decompose, depth, make_view, project, source
 from . import cli
 
 MIN_BEADS = 6           # 11 unknowns, 2 equations a bead (HZ 7.1)

@@ -22,7 +22,7 @@ from msg_adapters.calibration import BadCalibration, Calibration, calibration_to
 from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
 from msg_adapters.images import BadImage, array_to_image, grey
 
-from ..geometry import GeometryError, check_pair
+from ..geometry.cameras import GeometryError, check_pair
 from .cli import ToolError, need, run
 
 PLANES = ('a', 'b')

@@ -30,7 +30,7 @@ from msg_adapters.messages import stamp_ns
 from ..config import Config
 from ..data import Frame, Outcome, Reconstruction
 from ..pairing import PLANES, Counts, Pairer
-from ..pipeline import reconstruct
+from ..method.pipeline import reconstruct
 from ..worker import Camera, Job, Memory, adapt, camera, checked_camera, decode, image_window, view_of
 from .cli import ToolError
 

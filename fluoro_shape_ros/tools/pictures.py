@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..curve import arc_length, at_arc_length
-from ..geometry import pixels_per_metre, project
+from ..geometry.curve import arc_length, at_arc_length
+from ..geometry.cameras import pixels_per_metre, project
 from ..overlay import FOUND, TIP, free_corner, grey_levels
 from .cli import need
 

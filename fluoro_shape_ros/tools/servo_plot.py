@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry import project
+from ..geometry.cameras import project
 from ..overlay import FOUND, TIP
 from ..sim.plant import Plant
 from .pictures import STYLE, TRUTH

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..curve import arc_length, at_arc_length
+from ..geometry.curve import arc_length, at_arc_length
 from ..device import load_device
 from ..resources import resource_path
 from ..sim import plant

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..device import load_device, presets
-from ..geometry import check_pair
+from ..geometry.cameras import check_pair
 from ..node import own_arguments
 from ..sim import carm, ct, imaging, scenes, variety, xray
 from ..sim.placement import KINDS

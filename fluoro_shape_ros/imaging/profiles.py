@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .curve import middle
+from ..geometry.curve import middle
 
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips

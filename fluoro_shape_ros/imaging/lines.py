@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from .centerline import RIDGE_Z, Ridges
+from .ridges import RIDGE_Z, Ridges
 
 BRANCH_Z = 5.0          # standard deviations of the noise by which a branch stands out on average
 END_PX = 12             # length over which the direction of a branch's end is measured

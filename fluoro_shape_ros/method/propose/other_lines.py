@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from .beside import APART_PX, dark_along
-from .curve import middle
-from .fit import Fit
-from .geometry import pixels_per_metre
-from .solver import Layout, solve
-from .strips import Measurement, Sheet, cut
+from ..fit.neighbours import APART_PX, dark_along
+from ...geometry.curve import middle
+from ..fit.fit import Fit
+from ...geometry.cameras import pixels_per_metre
+from ..fit.solver import Layout, solve
+from ...imaging.strips import Measurement, Sheet, cut
 
 STEP = 3                # px, between the strips
 REACH_PX = 12           # how far to either side another line is looked for

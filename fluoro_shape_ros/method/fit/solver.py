@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dpbsv
 
-from .curve import middle
-from .geometry import projection_jacobian
-from .spline import Spline3, bending
-from .strips import Measurement, Strips
+from ...geometry.curve import middle
+from ...geometry.cameras import projection_jacobian
+from ...geometry.spline import Spline3, bending
+from ...imaging.strips import Measurement, Strips
 
 BEND_SIGMA = 3e-3 / 0.01**3     # 1/m^2: typical change of curvature along a device (third differences of 3 mm at control points 10 mm apart)
 SLIDE = 1e-4            # m: images do not see a curve slide along itself, so no step may

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .curve import arc_length
-from .geometry import depth, isocenter
-from .matching import Alignment
-from .spline import bending
+from ...geometry.curve import arc_length
+from ...geometry.cameras import depth, isocenter
+from .alignment import Alignment
+from ...geometry.spline import bending
 from scipy.interpolate import BSpline
 
 ALONG = 0.3             # correspondences along the curve count this much of what is seen across it

@@ -9,20 +9,20 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .centerline import find_ridges, ridge_scale, shrinking
-from .chains import Candidate, find_candidates
-from .data import Outcome
-from .fit import COARSE, Fit, fit
-from .follow import follow
-from .geometry import distort, fundamental, isocenter, pixels_per_metre, project, undistort
-from .hop import other_lines
-from .matching import align
+from ..imaging.ridges import find_ridges, ridge_scale, shrinking
+from ..imaging.lines import Candidate, find_candidates
+from ..data import Outcome
+from .fit.fit import COARSE, Fit, fit
+from .propose.follow import follow
+from ..geometry.cameras import distort, fundamental, isocenter, pixels_per_metre, project, undistort
+from .propose.other_lines import other_lines
+from .propose.alignment import align
 from .plausibility import CLEARER, MIN_WEAKEST, alike_device, blunt, clear, doubt, evidence
-from .prior import Guess, borne_out, whole
-from .start import first_curve
-from .profiles import apparent_width, likeness, odd_width, pieces
-from .strips import Sheet, cut_along, half_width_range
-from .sweep import darkness, sweep
+from .prediction import Guess, borne_out, whole
+from .propose.first_curve import first_curve
+from ..imaging.profiles import apparent_width, likeness, odd_width, pieces
+from ..imaging.strips import Sheet, cut_along, half_width_range
+from .propose.sweep import darkness, sweep
 
 LINES = 14              # strongest lines of an image that are looked at closely
 CANDIDATES = 6          # most device-like ones among them that are compared between the planes ...

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .config import Config
-from .curve import curvature, middle
-from .data import Outcome
-from .fit import Fit, contrast_ratio, crowded, ends_shown, shown
+from ..config import Config
+from ..geometry.curve import curvature, middle
+from ..data import Outcome
+from .fit.fit import Fit, contrast_ratio, crowded, ends_shown, shown
 
 MIN_LIKENESS = 0.96     # correlation of the profile seen with a cylinder's shadow, in the worse plane
 MIN_WEAKEST = 0.9      # the same, of the best of the worst pieces in a row

@@ -9,21 +9,21 @@ import cv2
 import numpy as np
 
 from . import paper
-from .config import Config
-from .curve import arc_length, distance_to, even_steps, middle, resample
-from .data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
+from ..config import Config
+from ..geometry.curve import arc_length, distance_to, even_steps, middle, resample
+from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
 from .detect import Detection, detect, found_near, track
-from .ends import tip_is_last
-from .field import border_distance, field_of_view
-from .fit import Fit
-from .follow import reach_px
-from .geometry import GeometryError, calibration_covariance, check, crop, distort, pixels_per_metre, project, undistort
-from .mask import subtract
-from .motion import going_on
+from .tip import tip_is_last
+from ..imaging.field import border_distance, field_of_view
+from .fit.fit import Fit
+from .propose.follow import reach_px
+from ..geometry.cameras import GeometryError, calibration_covariance, check, crop, distort, pixels_per_metre, project, undistort
+from ..imaging.mask import subtract
+from .propose.motion import going_on
 from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
-from .planes import both
-from .prior import Guess, borne_out, informed, judged, look
-from .strips import Sheet
+from ..imaging.parallel import both
+from .prediction import Guess, borne_out, informed, judged, look
+from ..imaging.strips import Sheet
 
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
 EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on

@@ -11,15 +11,15 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from .beside import without_neighbours
-from .curve import arc_length, middle
-from .extent import BLURS_PX, End, bulge, locate, supported
-from .geometry import depth, pixels_per_metre
+from .neighbours import without_neighbours
+from ...geometry.curve import arc_length, middle
+from .ends import BLURS_PX, End, bulge, locate, supported
+from ...geometry.cameras import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
-from .spline import Spline3, prolong, through
-from .profiles import (OPAQUE, PIECE, WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow,
+from ...geometry.spline import Spline3, prolong, through
+from ...imaging.profiles import (OPAQUE, PIECE, WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow,
                        pieces, shadow, straight_on)
-from .strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
+from ...imaging.strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for

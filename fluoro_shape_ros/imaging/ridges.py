@@ -8,7 +8,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from .curve import middle
+from ..geometry.curve import middle
 
 RIDGE_Z = 3.5           # ridge points stand out from the noise by this many standard deviations
 MAX_RIDGE_SHARE = 0.015 # of the pixels, at most: the strongest

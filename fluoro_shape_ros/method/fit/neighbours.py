@@ -7,9 +7,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from .curve import middle
-from .profiles import shadow
-from .strips import Strips, darkness_across
+from ...geometry.curve import middle
+from ...imaging.profiles import shadow
+from ...imaging.strips import Strips, darkness_across
 
 APART_PX = 2.5          # beyond the device's half width, from its middle to that of the nearest line that can be told from it
 ALONG = 9               # strips over which a line is looked for

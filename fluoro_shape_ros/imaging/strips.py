@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .curve import middle
-from .data import View
-from .geometry import distort
-from .planes import both
+from ..geometry.curve import middle
+from ..data import View
+from ..geometry.cameras import distort
+from .parallel import both
 
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips

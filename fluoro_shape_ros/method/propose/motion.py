@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .data import Prior
+from ...data import Prior
 
 APART_NS = 500_000_000  # pairs farther apart do not tell a velocity
 AHEAD = 2.0             # times as far ahead as they lie apart: one pair may have been missed

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.linalg import rq
 
-from .data import Distortion, View
+from ..data import Distortion, View
 
 MIN_PLANE_ANGLE = np.deg2rad(5.0)   # below it depth is a guess: triangulation errors grow as 1 / sin(angle)
 PARALLEL = np.deg2rad(1.0)          # central rays below it are meant not to meet

@@ -12,10 +12,10 @@ from scipy.ndimage import uniform_filter1d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from .config import Config
-from .curve import arc_length, at_arc_length
-from .geometry import epipolar_lines, fundamental, isocenter, pixels_per_metre, triangulate, undistort
-from .ridge import eigenvalues, hessian
+from ..config import Config
+from ..geometry.curve import arc_length, at_arc_length
+from ..geometry.cameras import epipolar_lines, fundamental, isocenter, pixels_per_metre, triangulate, undistort
+from ..imaging.hessian import eigenvalues, hessian
 
 WIENER_PX = 6
 BETA_1 = 2 * 0.8**2

@@ -1,0 +1,1 @@
+"""Cameras, epipolar geometry, curves and splines."""

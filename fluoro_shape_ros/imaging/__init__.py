@@ -1,0 +1,1 @@
+"""What one image shows: the exposed field, lines, strips across a curve and their profiles."""

@@ -1,0 +1,1 @@
+"""A curve brought to rest on both images."""

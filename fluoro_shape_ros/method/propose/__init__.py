@@ -1,0 +1,1 @@
+"""Where the device may be: first curves in space."""
