@@ -64,6 +64,7 @@ class PlausibilityConfig:
     max_curvature: float = _p(0.0, 'Largest believable curvature of the backbone; 0: the rule of Burgner et al. 2011, eq. 3', unit='1/m', low=0.0, high=1e6)
     max_reprojection_px: float = _p(3.0, 'Largest believable median distance between the reprojected backbone and the centreline seen', unit='px', low=0.1, high=100.0)
     max_tip_sigma: float = _p(0.0, 'Largest standard deviation of the tip in its worst direction; 0: no check', unit='m', low=0.0, high=1.0)
+    min_confidence: float = _p(0.95, 'Least probability of being right that a backbone is published with', low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)

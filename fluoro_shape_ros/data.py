@@ -29,6 +29,7 @@ class Outcome(Enum):
     POORLY_EXPLAINED = 'centerline_poorly_explained'
     LENGTH = 'length_out_of_bounds'
     TIP_UNCERTAIN = 'tip_too_uncertain'
+    LOW_CONFIDENCE = 'confidence_too_low'
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,7 @@ class Reconstruction:
     centerlines: tuple[Centerline | None, Centerline | None] = (None, None)
     stage_seconds: dict[str, float] = field(default_factory=dict)   # wall time of each stage
     prediction: str = ''                                # agrees, not compared, or ignored and why; empty: there was none
+    confidence: float = float('nan')                    # probability that the shape is right; of a rejected pair that of the best curve tried; NaN: none was, or not known
 
     def __post_init__(self):
         if (self.outcome is Outcome.OK) != (self.shape is not None):

@@ -21,8 +21,6 @@ from .overlay import overlay, words
 from .pairing import PLANES
 from .worker import Job, decode
 
-OF_SHAPES = {'tip_pose': (PoseWithCovarianceStamped, shape_to_tip_pose), 'backbone_points': (PointCloud2, shape_to_cloud)}
-
 
 class Outputs:
     """The publishers of results; reliable, depth 1, and QoS overrides are allowed. Used by the worker's thread alone."""
@@ -31,7 +29,7 @@ class Outputs:
         def publisher(kind, topic):
             return node.create_publisher(kind, topic, QoSProfile(depth=1), qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self._backbone, self._tip = publisher(Path, 'backbone'), publisher(PointStamped, 'tip')
-        self._of_shapes = [(publisher(kind, topic), adapter) for topic, (kind, adapter) in OF_SHAPES.items()]
+        self._pose, self._points = publisher(PoseWithCovarianceStamped, 'tip_pose'), publisher(PointCloud2, 'backbone_points')
         self._markers = publisher(MarkerArray, 'markers')
         self._overlays = [publisher(Image, f'plane_{plane}/overlay') for plane in PLANES]
 
@@ -43,10 +41,10 @@ class Outputs:
 
     def explain(self, job: Job, frame: Frame | None, result: Reconstruction) -> None:
         """Publish what else there is to say of a pair, of a rejected one too; `frame` is None where the messages were no frame."""
-        if result.shape is not None:
-            for out, adapter in self._of_shapes:
-                if out.get_subscription_count():
-                    out.publish(adapter(result.shape, job.stamp_ns, job.frame_id, ros_message))
+        if result.shape is not None and self._pose.get_subscription_count():
+            self._pose.publish(shape_to_tip_pose(result.shape, job.stamp_ns, job.frame_id, ros_message))
+        if result.shape is not None and self._points.get_subscription_count():
+            self._points.publish(shape_to_cloud(result.shape, result.confidence, job.stamp_ns, job.frame_id, ros_message))
         if self._markers.get_subscription_count():
             self._markers.publish(_markers(job, frame, result))
         for plane, out in enumerate(self._overlays):

@@ -68,11 +68,13 @@ def words(result: Reconstruction) -> list[str]:
     """Outcome and reason for people, a line each, the most important first; ASCII."""
     name = result.outcome.value.replace('_', ' ')
     shape = result.shape
+    sure = '' if np.isnan(result.confidence) else f'confidence {result.confidence:.3f}'
     if shape is None:
-        return ['no result', ': '.join(dict.fromkeys((name, result.detail or name))).encode('ascii', 'replace').decode()]
+        reason = ': '.join(dict.fromkeys((name, result.detail or name))).encode('ascii', 'replace').decode()
+        return ['no result', reason, *([f'the best curve has {sure}'] if sure else [])]
     sigma = tip_sigma(shape)
     size = f'{shape.length * 1e3:.1f} mm long' + ('' if np.isnan(sigma) else f', tip +-{sigma * 1e3:.2f} mm')
-    return [f'{name}, {size}', *(warning.replace('_', ' ') for warning in result.warnings)]
+    return [', '.join(filter(None, (name, sure, size))), *(warning.replace('_', ' ') for warning in result.warnings)]
 
 
 def tip_sigma(shape: Shape) -> float:

@@ -72,6 +72,7 @@ class ReconstructionSummary:
     outcome: Outcome | None = None  # of the last pair; None: there was none yet
     detail: str = ''
     warnings: tuple[str, ...] = ()  # of the last pair
+    confidence: float = float('nan')    # of the last pair; NaN: not known
     prediction: str = ''            # what became of it for the last pair
     notes: tuple[str, ...] = ()     # what else went wrong lately
     silent_s: float | None = None   # since the last pair
@@ -152,10 +153,15 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
         level, message = WARN, '; '.join(notes)
     else:
         level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images' if ms else '')
-    values = {'last outcome': last, 'last detail': s.detail, 'warnings': ', '.join(s.warnings), 'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction,
-              'overdue pairs': s.overdue,
+    values = {'last outcome': last, 'last detail': s.detail, 'confidence': probability(s.confidence), 'warnings': ', '.join(s.warnings),
+              'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction, 'overdue pairs': s.overdue,
               'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
     return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
+
+
+def probability(value: float) -> str:
+    """Three decimals; empty where it is not known (NaN)."""
+    return '' if value != value else f'{value:.3f}'
 
 
 def diagnostic_array(statuses: list[Status], stamp_ns: int, node_name: str, new: New):
@@ -241,7 +247,7 @@ class Tally:
         with self._lock:
             latency = tuple(value for _, value in self._recent(good, self._clock()))
             outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
-        seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, prediction=done.prediction)
+        seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, confidence=done.confidence, prediction=done.prediction)
         return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes,
                                      overdue=self.count('overdue'), **seen, **known)
 

@@ -15,7 +15,7 @@ from fluoro_shape_ros.data import Shape
 from .messages import New, header
 
 MAX_POSES = 100_000
-CLOUD_FIELDS = ('x', 'y', 'z', 's', 'sigma', 'residual_a_px', 'residual_b_px')
+CLOUD_FIELDS = ('x', 'y', 'z', 's', 'sigma', 'residual_a_px', 'residual_b_px', 'confidence')
 UNKNOWN_VARIANCE = 1e6              # m^2: PoseWithCovariance has no mark for "unknown", and NaN or -1 upsets filters
 ANY_ANGLE_VARIANCE = np.pi**2 / 3   # rad^2, of an angle about which nothing is known: uniform on the circle
 TIP_CHORD = 0.01                    # m, the end piece over which the tip's direction is judged to be known
@@ -62,9 +62,12 @@ def shape_to_tip_pose(shape: Shape, stamp_ns: int, frame_id: str, new: New):
                pose=new('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=tip_covariance(shape)))
 
 
-def shape_to_cloud(shape: Shape, stamp_ns: int, frame_id: str, new: New):
-    """sensor_msgs/PointCloud2 with the float32 fields x, y, z, s, sigma (m, in the worst direction), residual_a_px, residual_b_px; NaN: not known."""
-    rows = np.c_[shape.points, shape.s, _worst_sigma(shape.covariance), shape.residuals_px].astype(np.float32)
+def shape_to_cloud(shape: Shape, confidence: float, stamp_ns: int, frame_id: str, new: New):
+    """sensor_msgs/PointCloud2 with the float32 fields x, y, z, s, sigma (m, in the worst direction), residual_a_px, residual_b_px, confidence; NaN: not known.
+
+    The confidence is the probability that the shape is right, the same in every point.
+    """
+    rows = np.c_[shape.points, shape.s, _worst_sigma(shape.covariance), shape.residuals_px, np.full(len(shape.points), confidence)].astype(np.float32)
     fields = [new('sensor_msgs/msg/PointField', name=name, offset=4 * k, datatype=_FLOAT32, count=1) for k, name in enumerate(CLOUD_FIELDS)]
     return new('sensor_msgs/msg/PointCloud2', header=header(new, stamp_ns, frame_id), height=1, width=len(rows), fields=fields,
                is_bigendian=sys.byteorder == 'big', point_step=rows.strides[0], row_step=rows.nbytes, data=rows.view(np.uint8),

@@ -151,6 +151,7 @@ def soak(node, client, seconds, rate, share, seed, growth_mb):
     if not client.connected() or not client.insist(lambda: client.paths, run.good, infos=run.infos()):
         run.failures.append('the node does not answer')
         return run, [(0, 0, 0)] * 2
+    run.fault('blank')      # what only a search without a device needs is started before anything is counted
     client.until(lambda: False, 2.0)    # by then none of the first ones is under way
     client.paths.clear()
     start, before, sent = time.monotonic(), None, 0

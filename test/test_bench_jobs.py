@@ -17,7 +17,7 @@ from fluoro_shape_ros.bench.families import Sources
 from fluoro_shape_ros.bench.trial import Task, attempt
 from fluoro_shape_ros.bench.variety import plain_trial
 from fluoro_shape_ros.tools.cli import ToolError
-from test_bench_variety import drawn, save
+from test_bench_variety import drawn, hide, save
 
 PATIENCE_S = 60.0       # for what a test waits for
 HOST = '127.0.0.1'
@@ -119,6 +119,7 @@ def test_a_killed_worker_changes_no_number(cluster, tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, 'AHEAD', 4)
     for seed in range(10):
         save(tmp_path / 'scenes' / str(seed), drawn(seed))
+    hide(tmp_path / 'scenes' / '5')
     tasks = [Task('open', seed, ('spline',), sources=Sources(open=tmp_path / 'scenes')) for seed in range(10)]
     expected = [numbers(trial) for trial in jobs.in_order(attempt, tasks, 2)]
     assert {t['answers']['spline']['right'] for t in expected} == {True, False}

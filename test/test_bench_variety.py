@@ -39,11 +39,19 @@ def save(folder, scene, **changes):
     (folder / 'scene.json').write_text(json.dumps({name: value for name, value in about.items() if value is not None}))
 
 
+def hide(folder):
+    """Plane B of a saved scene shows nothing any more, so that it is refused."""
+    file = str(folder / 'plane_b.png')
+    image = cv2.imread(file, cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(file, np.full_like(image, int(np.median(image))))
+
+
 @pytest.fixture
 def folder(tmp_path):
     """Four scenes: three rods, of which the third is refused, and between them one pair without a device."""
     for seed in range(3):
         save(tmp_path / 'scenes' / f'rod_{seed}', drawn(seed))
+    hide(tmp_path / 'scenes' / 'rod_2')
     blank = scenes.xray_run(9, views=SMALL, lengths=(0.067, 0.1), anatomy=False)
     save(tmp_path / 'scenes' / 'none_0', replace(blank.scene(), frame=blank.without_device()), family='none', device=False, backbone_m=[])
     return tmp_path / 'scenes'
@@ -117,6 +125,9 @@ def test_trials_are_plain_for_json():
     answer = plain['answers']['spline']
     assert (answer['outcome'], answer['right'], answer['silent_failure'], answer['cpu_s'], answer['surprise']) == ('ok', False, True, 0.3, 9.0)
     assert_allclose(answer['errors_m']['tip'], 2.5e-3)
+    assert answer['confidence'] is None
+    sure = Trial(TRIALS[1].task, {'spline': replace(GIVEN[1], confidence=0.998)}, None)
+    assert variety.plain_trial(sure)['answers']['spline']['confidence'] == 0.998 and variety.plain([sure]) == variety.plain(TRIALS[1:2])
     assert json.loads(json.dumps(variety.plain(TRIALS), allow_nan=False))['devices/spline/rod']['scenes'] == 3
 
 
@@ -128,7 +139,7 @@ class Canned:
 
     def __call__(self, frame, config, prior):
         self.config = config
-        return Reconstruction(Outcome.LENGTH, 'too long')
+        return Reconstruction(Outcome.LENGTH, 'too long', confidence=0.25)
 
 
 @pytest.fixture
@@ -143,7 +154,7 @@ def test_radius_is_given_off_and_the_base_kept_back(pipeline):
     answer = trial.answer(case, Config(), radius_error=0.25)
     assert_allclose(pipeline.config.detection.robot_radius, 1.25e-3)
     assert_allclose(pipeline.config.curve.base_position, case.scene.truth[0])
-    assert (answer.kind, answer.cpu_s >= 0) == ('rod', True)
+    assert (answer.kind, answer.cpu_s >= 0, answer.confidence) == ('rod', True, 0.25)
     trial.answer(case, Config(), base=False)
     assert pipeline.config.curve.base_position == ()
 

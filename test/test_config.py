@@ -26,7 +26,7 @@ def test_replace_keeps_the_rest():
 
 @pytest.mark.parametrize('name, value, reason', [
     ('robot_radius', -1.0, 'must lie in'), ('robot_radius', float('nan'), 'finite'), ('robot_radius', 'thin', 'number'), ('robot_radius', True, 'number'),
-    ('polarity', 'grey', 'must be one of dark, bright, auto'), ('rectified', 1, 'needs a bool'), ('mask_frames', 0, 'must lie in'),
+    ('polarity', 'grey', 'must be one of dark, bright, auto'), ('min_confidence', 1.01, 'must lie in'), ('rectified', 1, 'needs a bool'), ('mask_frames', 0, 'must lie in'),
     ('mask_frames', 2.5, 'needs a int'), ('base_position', [1.0, 2.0], 'needs 0 or 3 numbers'), ('expected_length', [0.2, 0.1], 'min < max'),
     ('expected_length', [0.1, float('inf')], 'finite')])
 def test_what_cannot_work_is_refused(name, value, reason):

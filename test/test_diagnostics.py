@@ -88,6 +88,18 @@ def test_values_name_every_counter():
     assert plane_status(PlaneSummary('b', reliability='best_effort')).values['reliability'] == 'best_effort'
 
 
+@pytest.mark.parametrize('result, shown', [
+    (Reconstruction(Outcome.LOW_CONFIDENCE, 'it ends at a wire', confidence=0.41263), '0.413'),
+    (Reconstruction(Outcome.NO_DEVICE_A, 'no curve'), ''),
+])
+def test_the_confidence_of_the_last_pair_is_told(tally, result, shown):
+    assert reconstruction_status(tally.reconstruction()).values['confidence'] == ''
+    tally.result(Reconstruction(Outcome.CURVATURE, 'too bent', confidence=0.9), 0.02)
+    tally.result(result, 0.02)
+    status = reconstruction_status(tally.reconstruction())
+    assert status.level == WARN and status.message == f'{result.outcome.value}: {result.detail}' and status.values['confidence'] == shown
+
+
 def test_rates_fade_and_silence_grows(tally, clock):
     clock.now += 60
     assert tally.silent_s('image a') is None

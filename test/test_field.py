@@ -1,6 +1,8 @@
-"""The exposed field: blades and intensifier corners are outside, a device is not."""
+"""The exposed field: blades and intensifier corners are outside, a device is not, nor is dense anatomy."""
 
+import cv2
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.imaging.field import border_distance, field_of_view
@@ -31,6 +33,78 @@ def test_a_dark_organ_inside_stays_field():
     image = np.full((200, 240), 180, np.uint8)
     image[80:130, 80:130] = 3
     assert (field_of_view(image) == 255).all()
+
+
+V, U = np.mgrid[0:256, 0:320]
+
+
+def blocked_where(dark, level=4, bright=180):
+    """The field of an image that is `level` where `dark`, and a `bright` ramp elsewhere."""
+    return field_of_view(np.where(dark, level, bright - 0.1 * U).astype(np.uint8))
+
+
+def assert_found(field, dark):
+    """Whether a field is what is not `dark`, but for pixels at its border."""
+    near = cv2.dilate(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3))), np.ones((17, 17))) > 0
+    assert ((field == 0) == dark)[~near].all() and 0 < near.mean() < 0.5
+
+
+OPENINGS = {
+    'one blade': U < 50,
+    'two blades': (U < 50) | (U > 270),
+    'four blades': (U < 50) | (U > 270) | (V < 30) | (V > 200),
+    'an intensifier': np.hypot(U - 160, V - 128) > 125,
+    'an intensifier aside': np.hypot(U - 130, V - 110) > 150,
+    'an intensifier with a blade': (np.hypot(U - 160, V - 128) > 125) | (V < 60),
+    'a small opening': np.hypot(U - 160, V - 128) > 50,
+}
+
+
+@pytest.mark.parametrize('name', OPENINGS)
+def test_a_convex_opening_is_found(name):
+    assert_found(blocked_where(OPENINGS[name]), OPENINGS[name])
+
+
+@pytest.mark.parametrize('turn_deg', [5, 20, 45])
+def test_blades_may_be_turned(turn_deg):
+    v, u = np.mgrid[0:768, 0:768] - 383.5
+    c, s = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    dark = (np.abs(c * u + s * v) > 270) | (np.abs(c * v - s * u) > 190)
+    assert_found(field_of_view(np.where(dark, 4, 180).astype(np.uint8)), dark)
+
+
+DENSE = {
+    'in a corner': np.hypot(U, V) < 120,
+    'in two corners': (np.hypot(U, V) < 100) | (np.hypot(U - 319, V - 255) < 100),
+    'at one side': np.hypot(U + 40, V - 128) < 110,
+    'a spine': np.abs(U - 160 - 20 * np.sin(V / 40)) < 40,
+    'a shoulder': (U < 120) & (V > 140),
+    'an island in the middle': np.hypot(U - 160, V - 128) < 60,
+}
+
+
+@pytest.mark.parametrize('name', DENSE)
+@pytest.mark.parametrize('level', [4, 12, 20])
+def test_dense_anatomy_blocks_nothing(name, level):
+    assert (blocked_where(DENSE[name], level) == 255).all()
+
+
+@pytest.mark.parametrize('name', ['in a corner', 'a spine', 'at one side'])
+def test_dense_anatomy_beside_a_blade_does_not_hide_that(name):
+    """At 8 % of the bright level, what is dark is not convex; the blade alone is darker still."""
+    blade = V < 40
+    image = np.where(DENSE[name], 14, 180)
+    assert_found(field_of_view(np.where(blade, 1, image).astype(np.uint8)), blade)
+
+
+@pytest.mark.parametrize('change', [lambda i: i.astype(np.uint16) * 200, lambda i: i.astype(np.float32) / 255, lambda i: i.astype(np.float32) - 4])
+def test_depth_and_range_of_the_image_do_not_matter(change):
+    image = np.where(OPENINGS['an intensifier'], 4, 180).astype(np.uint8)
+    assert np.array_equal(field_of_view(change(image)), field_of_view(image))
+
+
+def test_a_wide_device_that_runs_out_of_the_image_stays_field():
+    assert (blocked_where(np.abs(V - 0.5 * U - 40) < 10) == 255).all()
 
 
 def test_distance_to_the_border():

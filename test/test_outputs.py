@@ -1,5 +1,7 @@
 """What the node publishes only while somebody listens, on real topics."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,10 @@ from ros_client import BASE, BLANK, GOOD, SIZE, VIEWS, Client, NodeProcess, imag
 from sensor_msgs.msg import Image, PointCloud2                  # noqa: E402
 from visualization_msgs.msg import MarkerArray                  # noqa: E402
 
+from fluoro_shape_ros.config import Config                      # noqa: E402
+from fluoro_shape_ros.data import Outcome, Reconstruction, Shape     # noqa: E402
+from fluoro_shape_ros.outputs import Outputs                    # noqa: E402
+from fluoro_shape_ros.worker import Job                         # noqa: E402
 from msg_adapters.messages import stamp_ns                      # noqa: E402
 
 TOLERANCE = 0.0025      # m: an image pixel is 1 mm
@@ -47,7 +53,9 @@ def test_outputs_on_demand(client, heard):
     assert pose.pose.pose == path.poses[-1].pose
     variance = np.diag(pose.pose.covariance.reshape(6, 6))[:3]
     assert (variance > 0).all() and np.sqrt(variance.max()) < TOLERANCE
-    assert cloud.width == len(path.poses) and cloud.fields[4].name == 'sigma'
+    assert cloud.width == len(path.poses) and [cloud.fields[k].name for k in (4, -1)] == ['sigma', 'confidence']
+    confidence = np.frombuffer(cloud.data, '<f4').reshape(cloud.width, -1)[:, -1]
+    assert len(np.unique(confidence)) == 1 and not (np.abs(confidence - 0.5) > 0.5).any()      # NaN while it is not known
     tube = next(m for m in markers.markers if m.ns == 'tube')
     corners = np.array([[p.x, p.y, p.z] for p in tube.points])
     assert np.allclose(np.linalg.norm(corners[:, None] - points(path), axis=2).min(axis=1), 0.001, rtol=0.01)     # robot_radius
@@ -56,6 +64,31 @@ def test_outputs_on_demand(client, heard):
         u, v, w = P @ [*points(path)[len(path.poses) // 2], 1]
         pixels = np.frombuffer(picture.data, np.uint8).reshape(SIZE, SIZE, 3)
         assert np.ptp(pixels[round(v / w), round(u / w)]) > 60      # something coloured is drawn there
+
+
+class Recorder:
+    """Stands in for the node and its publishers, to each of which somebody listens."""
+
+    def __init__(self):
+        self.published = {}
+
+    def create_publisher(self, kind, topic, *_, **__):
+        return SimpleNamespace(publish=lambda msg: self.published.update({topic: msg}), get_subscription_count=lambda: 1)
+
+
+def test_the_confidence_of_a_result_is_in_every_point_and_in_words():
+    x = np.linspace(0, 0.1, 5)
+    shape = Shape(np.c_[x, 0 * x, 0 * x], x, np.full((5, 3, 3), np.nan), np.zeros((5, 2)))
+    job = Job(5, tuple(GOOD), (None, None), Config(), 0, 0.0)
+    node = Recorder()
+    Outputs(node).explain(job, None, Reconstruction(Outcome.OK, 'ok', shape, confidence=0.998))
+    cloud, pose, markers = (node.published[topic] for topic in ('backbone_points', 'tip_pose', 'markers'))
+    assert np.frombuffer(cloud.data, '<f4').reshape(5, -1)[:, -1].tolist() == [np.float32(0.998)] * 5
+    assert (stamp_ns(cloud), stamp_ns(pose)) == (5, 5)
+    assert [m.text for m in markers.markers if m.ns == 'outcome'] == ['ok, confidence 0.998, 100.0 mm long']
+    node = Recorder()
+    Outputs(node).explain(job, None, Reconstruction(Outcome.LOW_CONFIDENCE, 'it ends at a wire', confidence=0.25))
+    assert set(node.published) == {'markers', 'plane_a/overlay', 'plane_b/overlay'}
 
 
 def test_a_rejected_pair_is_shown_with_its_reason_and_nothing_else(client, heard):

@@ -29,8 +29,8 @@ def found(shape=None, lines=(None, None), **fields):
     return Reconstruction(Outcome.OK, 'ok', shape or straight(), centerlines=lines, **fields)
 
 
-def rejected(detail='only 3 px', lines=(None, None)):
-    return Reconstruction(Outcome.NO_CORRESPONDENCE, detail, centerlines=lines)
+def rejected(detail='only 3 px', lines=(None, None), **fields):
+    return Reconstruction(Outcome.NO_CORRESPONDENCE, detail, centerlines=lines, **fields)
 
 
 def colour_at(picture, points_px):
@@ -140,6 +140,15 @@ def test_words():
     assert o.words(rejected('only 3 px')) == ['no result', 'no correspondence: only 3 px']
     assert o.words(rejected('')) == ['no result', 'no correspondence']
     assert o.words(rejected('20 °')) == ['no result', 'no correspondence: 20 ?']      # OpenCV writes ASCII
+
+
+def test_words_say_how_sure_it_is():
+    assert o.words(found(confidence=0.998)) == ['ok, confidence 0.998, 50.0 mm long, tip +-1.00 mm']
+    assert o.words(found(straight(np.nan), confidence=0.998, warnings=('tip_ambiguous',))) == ['ok, confidence 0.998, 50.0 mm long', 'tip ambiguous']
+    assert o.words(rejected(confidence=0.0)) == ['no result', 'no correspondence: only 3 px', 'the best curve has confidence 0.000']
+    low = Reconstruction(Outcome.LOW_CONFIDENCE, 'it ends at a wire', confidence=0.4126)
+    assert o.words(low) == ['no result', 'confidence too low: it ends at a wire', 'the best curve has confidence 0.413']
+    assert strip(o.overlay(GREY, 0, low), o.WORDS)[0].max() > strip(o.overlay(GREY, 0, rejected()), o.WORDS)[0].max()      # a line more
 
 
 def strip(picture, colour):

@@ -1,6 +1,7 @@
 """fluoro_shape_replay: a bag of drawn pairs in, results out."""
 
 import csv
+import dataclasses
 import subprocess
 import sys
 
@@ -185,7 +186,7 @@ def test_tables_for_other_programs(run, tmp_path):
     paths = [path_to_points(path) for _, path in read(tmp_path / 'first' / 'out')['/backbone']]
     with (tmp_path / 'first' / 'out.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ['stamp_s', 'outcome', 's_m', 'x_m', 'y_m', 'z_m', 'sigma_m', 'residual_a_px', 'residual_b_px', 'reason']
+    assert list(rows[0]) == ['stamp_s', 'outcome', 's_m', 'x_m', 'y_m', 'z_m', 'sigma_m', 'residual_a_px', 'residual_b_px', 'reason', 'confidence']
     points = np.array([[row[f'{axis}_m'] or 'nan' for axis in 'xyz'] for row in rows], float)
     n = len(paths[0])
     assert np.allclose(points[:n], paths[0], atol=1e-9) and np.allclose(points[n + 1:], paths[1], atol=1e-9)
@@ -195,6 +196,25 @@ def test_tables_for_other_programs(run, tmp_path):
     assert arrays['stamp_ns'].tolist() == [5 * SECOND, 5_100_000_000, 5_200_000_000] and arrays['outcome'][1] == 'no_device_in_plane_a'
     assert np.array_equal(arrays['points_m'][arrays['pair'] == 2], paths[1]) and not (arrays['pair'] == 1).any()
     assert arrays['residual_px'].shape == (2 * n, 2) and arrays['sigma_m'].shape == arrays['s_m'].shape == (2 * n,) and str(arrays['frame_id']) == 'plane_a_optical'
+
+
+def test_the_confidence_goes_everywhere(run, tmp_path, monkeypatch):
+    """Bag, CSV and NPZ have it of every pair; where it is not known, it is empty or NaN."""
+    given = {5 * SECOND: 0.998, 5_100_000_000: 0.25, 5_200_000_000: np.nan}
+    intact = offline.reconstruct
+    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: dataclasses.replace(intact(frame, config, prior), confidence=given[frame.stamp_ns]))
+    assert main(run, '--out', tmp_path / 'out', '--csv', tmp_path / 'out.csv', '--npz', tmp_path / 'out.npz', '-p', BASE, '-p', 'min_confidence=0') == 0
+    results = read(tmp_path / 'out')
+    assert [{v.key: v.value for v in m.status[0].values}['confidence'] for _, m in results['/diagnostics']] == ['0.998', '0.250', '']
+    first, last = (np.frombuffer(bytes(m.data), '<f4').reshape(m.width, -1)[:, -1] for _, m in results['/backbone_points'])
+    assert [m.fields[-1].name for _, m in results['/backbone_points']] == ['confidence'] * 2
+    assert set(first) == {np.float32(0.998)} and np.isnan(last).all()
+    with (tmp_path / 'out.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert {(row['stamp_s'], row['outcome'], row['confidence']) for row in rows} == {
+        ('5.000000000', 'ok', '0.998000000'), ('5.100000000', 'no_device_in_plane_a', '0.250000000'), ('5.200000000', 'ok', '')}
+    assert [bool(row['reason']) for row in rows] == [row['outcome'] != 'ok' for row in rows]
+    assert np.array_equal(np.load(tmp_path / 'out.npz')['confidence'], list(given.values()), equal_nan=True)
 
 
 def test_images_read_ahead_come_in_order_and_errors_in_their_turn():

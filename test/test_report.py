@@ -92,11 +92,12 @@ def test_the_page_in_a_browser(page, tmp_path):
 # ---- what is kept
 
 
-def answered(k, residual=1.0, points=5):
+def answered(k, residual=1.0, points=5, confidence=np.nan):
     """The answer to pair k: a straight backbone along x, or none where residual is NaN."""
     x = np.linspace(0, 0.1, points)
     shape = Shape(np.c_[x, np.full(points, k * 1e-5), 0 * x], x, np.full((points, 3, 3), np.nan), np.full((points, 2), residual))
-    result = Reconstruction(Outcome.LENGTH, 'too long') if np.isnan(residual) else Reconstruction(Outcome.OK, 'ok', shape)
+    outcome = (Outcome.LENGTH, 'too long') if np.isnan(residual) else (Outcome.OK, 'ok', shape)
+    result = Reconstruction(*outcome, confidence=confidence)
     return Answer(Job((k + 1) * 10**8, (np.zeros((4, 4)),) * 2, (None, None), Config(), 0, 0.0), None, result, 0.02)
 
 
@@ -132,6 +133,13 @@ class NoImages:
         return None
 
 
+def test_every_pair_has_its_confidence_the_rejected_too():
+    h = history.History()
+    for k, (residual, confidence) in enumerate([(1.0, 0.99849), (np.nan, 0.4), (np.nan, np.nan)]):
+        h.take(answered(k, residual, confidence=confidence))
+    assert report.page_data(h, NoImages(), 'run')['confidence'] == [0.998, 0.4, None]
+
+
 def test_a_minute_of_pairs_fits_into_ten_megabytes():
     """With what two overlays of 400 KB add."""
     rng = np.random.default_rng(1)
@@ -146,5 +154,5 @@ def test_a_minute_of_pairs_fits_into_ten_megabytes():
 
 def test_what_is_not_known_has_no_number():
     data = report.page_data(taken([np.nan]), NoImages(), 'run')
-    assert data['sigma'] == data['length'] == data['tip'][0] == [None] and data['overlays'] == [] and data['shapes'] == [None]
+    assert data['sigma'] == data['length'] == data['tip'][0] == data['confidence'] == [None] and data['overlays'] == [] and data['shapes'] == [None]
     assert report.curve(answered(0).result.shape)[3] == [None] * 5

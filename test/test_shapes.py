@@ -142,18 +142,26 @@ def test_cloud(new):
     covariance = np.tile(np.diag([1e-8, 4e-8, 9e-8]), (5, 1, 1))
     covariance[1] = np.nan
     residuals = np.arange(10.0).reshape(5, 2)
-    msg = shape_to_cloud(Shape(case.points, case.s, covariance, residuals), STAMP, FRAME, new)
+    msg = shape_to_cloud(Shape(case.points, case.s, covariance, residuals), 0.998, STAMP, FRAME, new)
     assert (stamp_ns(msg), msg.header.frame_id, msg.height, msg.width, msg.row_step) == (STAMP, FRAME, 1, 5, 5 * msg.point_step)
     assert {f.datatype for f in msg.fields} == {7} and {f.count for f in msg.fields} == {1}
     layout = np.dtype({'names': [f.name for f in msg.fields], 'formats': ['>f4' if msg.is_bigendian else '<f4'] * len(msg.fields),
                        'offsets': [f.offset for f in msg.fields], 'itemsize': msg.point_step})
     cloud = np.frombuffer(msg.data, layout)
-    assert list(cloud.dtype.names) == ['x', 'y', 'z', 's', 'sigma', 'residual_a_px', 'residual_b_px']
+    assert list(cloud.dtype.names) == ['x', 'y', 'z', 's', 'sigma', 'residual_a_px', 'residual_b_px', 'confidence']
     assert_allclose(np.c_[cloud['x'], cloud['y'], cloud['z']], case.points, rtol=1e-6, atol=1e-9)
     assert_allclose(cloud['s'], case.s, rtol=1e-6)
     assert_allclose(cloud['sigma'], [3e-4, np.nan, 3e-4, 3e-4, 3e-4], rtol=1e-6)
     assert_allclose(np.c_[cloud['residual_a_px'], cloud['residual_b_px']], residuals)
+    assert cloud['confidence'].tolist() == [np.float32(0.998)] * 5
     assert not msg.is_dense
+
+
+@pytest.mark.parametrize('confidence, dense', [(0.998, True), (float('nan'), False)])
+def test_a_cloud_is_dense_where_all_is_known(new, confidence, dense):
+    msg = shape_to_cloud(shape(arc(n=5).points, variance=1e-8), confidence, STAMP, FRAME, new)
+    last = np.frombuffer(msg.data, '>f4' if msg.is_bigendian else '<f4').reshape(5, -1)[:, -1]
+    assert msg.is_dense == dense and np.array_equal(last, np.full(5, confidence, np.float32), equal_nan=True)
 
 
 def path(new, points):

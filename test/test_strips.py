@@ -12,7 +12,7 @@ from scipy.special import ndtr
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry.cameras import decompose, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
-from fluoro_shape_ros.imaging.profiles import (WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow, pieces,
+from fluoro_shape_ros.imaging.profiles import (WIDTHS, apparent_width, background, contrast_of, likeness, mean_profile, odd_width, own_shadow, pieces,
                                        shadow, straight_on)
 from fluoro_shape_ros.imaging.strips import FOUND_PX, Measurement, Model, Sheet, Strips, cut, cut_along, half_width_range, measure, search
 
@@ -252,12 +252,6 @@ def test_pieces_are_medians_along_each_line_and_a_short_line_is_one():
     assert nothing.shape == (0, 3) and len(none) == 0
 
 
-def test_the_best_of_the_worst_pieces_in_a_row():
-    assert best_of_worst(np.array([0.99, 0.4, 0.95, 0.99])) == 0.99       # hidden in one piece
-    assert best_of_worst(np.array([0.99, 0.7, 0.4, 0.8, 0.99])) == 0.8    # another line for three of them
-    assert best_of_worst(np.array([0.6, 0.7])) == 0.7 and best_of_worst(np.zeros(0)) == 0.0
-
-
 def darkened(*shares):
     """(B, 9) profiles, square roots of counts, whose middle lacks each of the shares of a background that differs from piece to piece."""
     counts = np.full((len(shares), 9), 100.0) * np.arange(1, len(shares) + 1)[:, None]
@@ -268,17 +262,6 @@ def darkened(*shares):
 def test_contrast_by_hand():
     assert_allclose(contrast_of(darkened(0.2, 0.5)), [0.2, 0.5])
     assert_allclose(straight_on(np.array([0.2, 0.36]), np.array([1.0, 0.5])), [0.2, 0.2])      # twice the path: 0.8^2 is left
-
-
-def test_what_fades_towards_an_end_by_hand():
-    usual, half = np.full(6, 0.2), np.r_[np.full(4, 0.2), 0.1, 0.1]
-    assert_allclose(fading(darkened(*usual), np.ones(6)), 0, atol=1e-12)
-    assert_allclose(fading(darkened(*half), np.ones(6)), [0, np.log(0.5)], atol=1e-12)
-    assert_allclose(fading(darkened(*half[:5], 0.2), np.ones(6)), 0, atol=1e-12)               # one piece may be hidden
-    assert_allclose(fading(darkened(*usual), np.r_[np.ones(4), 0.5, 0.5]), [0, np.log((1 - 0.8**0.5) / 0.2)], atol=1e-12)      # it should look darker there
-    assert_allclose(fading(darkened(*np.full(6, 0.8)), np.r_[np.ones(4), 0.5, 0.5]), 0, atol=1e-12)     # opaque: it does not
-    assert_allclose(fading(darkened(*np.r_[np.full(4, 0.2), -0.1, 0.0]), np.ones(6)), [0, -2], atol=1e-12)
-    assert_allclose(fading(darkened(0.2, 0.2, 0.1, 0.1), np.ones(4)), 0, atol=1e-12)                       # too short to tell
 
 
 def test_how_wide_a_line_looks_and_when_that_is_odd():

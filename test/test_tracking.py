@@ -82,16 +82,16 @@ def test_tracking_answers_as_a_search_does_and_needs_none(motion):
         searched = search(scene)
         assert is_right(answer, scene) and is_right(searched, scene), (answer.detail, searched.detail)
         assert same(answer.shape, searched.shape)
-        assert 'track' in answer.stage_seconds and 'detect' not in answer.stage_seconds
+        assert 'track' in answer.stage_seconds and 'search' not in answer.stage_seconds
 
 
 def test_a_device_faster_than_any_search_around_it_is_expected_where_it_will_be():
     *_, now = scenes = pictures([moved(0.0055 * k) for k in range(3)])
     first, second = (search(scene).shape for scene in scenes[:2])
     known = dict(previous=second, previous_stamp_ns=scenes[1].frame.stamp_ns)
-    assert 'detect' in reconstruct(now.frame, CONFIG, Prior(**known)).stage_seconds
+    assert 'search' in reconstruct(now.frame, CONFIG, Prior(**known)).stage_seconds
     answer = reconstruct(now.frame, CONFIG, Prior(**known, before=first, before_stamp_ns=scenes[0].frame.stamp_ns))
-    assert 'detect' not in answer.stage_seconds and is_right(answer, now) and same(answer.shape, search(now).shape)
+    assert 'search' not in answer.stage_seconds and is_right(answer, now) and same(answer.shape, search(now).shape)
 
 
 def test_a_tip_that_swings_while_most_of_the_device_stays_is_followed():
@@ -99,7 +99,7 @@ def test_a_tip_that_swings_while_most_of_the_device_stays_is_followed():
     scenes = [replace(entering, shape=posed(entering.shape, 0.0, 0.5 * k)).scene(index=k) for k in range(4)]     # the tip by 3.7 mm a pair
     for scene, answer in zip(scenes[1:], follow(scenes)[1:]):
         assert answer.shape is not None and np.linalg.norm(answer.shape.tip - scene.truth[-1]) < 2 * RIGHT, answer.detail
-        assert 'detect' not in answer.stage_seconds
+        assert 'search' not in answer.stage_seconds
 
 
 @pytest.mark.parametrize('there', [moved(0.02, 0.0, -0.02), posed(run().shape, 1.0, 1.0)], ids=['elsewhere', 'another shape'])
@@ -113,7 +113,7 @@ def test_an_end_that_slips_far_is_compared_with_what_all_of_the_images_show():
     before, now = pictures([run().shape, moved(0.005)])
     first = search(before).shape
     answer = reconstruct(now.frame, CONFIG, Prior(previous=first))
-    assert {'track', 'detect'} <= set(answer.stage_seconds) and same(answer.shape, search(now).shape)
+    assert {'track', 'search'} <= set(answer.stage_seconds) and same(answer.shape, search(now).shape)
 
 
 @pytest.mark.parametrize('missed', [1, 3, 10])
@@ -127,7 +127,7 @@ def test_where_the_device_is_no_more_everything_is_searched():
     before, after = pictures([run().shape, moved(STEP)])
     empty, previous = run().without_device(), search(before).shape
     gone = reconstruct(empty, CONFIG, Prior(previous=previous))
-    assert 'detect' in gone.stage_seconds and gone.outcome is reconstruct(empty, CONFIG).outcome
+    assert 'search' in gone.stage_seconds and gone.outcome is reconstruct(empty, CONFIG).outcome
     assert is_right(follow([after], previous)[0], after)
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ..config import fields
+from ..method.judge import judge_of
 from ..tools.cli import ToolError, count, natural, need, positive, run
-from . import latency, memory, prediction, speed, variety
+from . import judge, latency, memory, prediction, speed, variety
 from .case import Family
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Sources, families, on_real
@@ -35,6 +36,7 @@ def main(argv=None) -> int:
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
     _add_variety(commands)
+    _add_judge(commands)
     _add_speed(commands)
     _add_latency(commands)
     _add_memory(commands)
@@ -224,6 +226,9 @@ def _add_variety(commands) -> None:
     command.add_argument('--open', type=Path, metavar='DIR', help='for open: a folder of scenes, each with plane_a.png, plane_b.png and scene.json; '
                          'these are taken by name from the first, whatever --first-seed')
     command.add_argument('--no-base', action='store_true', help='keep the base\'s position back')
+    command.add_argument('--min-confidence', type=float, metavar='P', help='instead of the default of the parameter; 0: the best curve of every pair is published')
+    command.add_argument('--plot', type=Path, metavar='FILE.png', help='how often confidence is right, and what is answered and wrong over min_confidence; '
+                         'best with --min-confidence 0')
     command.add_argument('--radius-error', type=_radius_error, default=0.0, metavar='R', help='give 1 + R times the true radius (default: 0)')
     command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every scene\'s answers there, in m and s')
     command.add_argument('--pictures', type=natural, default=0, metavar='N', help='contact sheets of the first N pairs of each family (default: 0)')
@@ -253,9 +258,15 @@ def _variety(args, parser: argparse.ArgumentParser) -> int:
     """Try all scenes, print the table, write the files and sheets."""
     sources = _sources(args, parser)
     _check_first_seed(args, parser)
+    if args.min_confidence is not None and not 0 <= args.min_confidence <= 1:
+        parser.error(f'--min-confidence {args.min_confidence:g} does not lie in 0 to 1')
+    if args.plot and args.plot.suffix.lower() != '.png':
+        parser.error(f'--plot {args.plot}: only .png can be drawn')
     known = variety.known(sources)
     names = list(dict.fromkeys(args.families or known))
-    _check_files(args.json)
+    _check_files(args.json, args.plot)
+    if args.plot:
+        need('matplotlib', 'plot')
     if args.pictures:
         args.sheets.mkdir(parents=True, exist_ok=True)
     if 'gvxr' in names:
@@ -263,7 +274,7 @@ def _variety(args, parser: argparse.ArgumentParser) -> int:
     if args.scheduler:
         need('distributed', 'cluster')
     methods = tuple(dict.fromkeys(args.methods))
-    tasks = [Task(name, seed, methods, sources=sources, base=not args.no_base, radius_error=args.radius_error,
+    tasks = [Task(name, seed, methods, sources=sources, base=not args.no_base, radius_error=args.radius_error, min_confidence=args.min_confidence,
                   picture=args.pictures_of if args.pictures and (k < args.pictures or args.pictures_of != 'all') else '')
              for name in names for k, seed in enumerate(variety.seeds(known[name], args.first_seed, args.scenes))]
     done = tqdm(in_order(attempt, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene', disable=None)
@@ -273,8 +284,45 @@ def _variety(args, parser: argparse.ArgumentParser) -> int:
         given = {'command': args.command, 'first_seed': args.first_seed, 'base': not args.no_base, 'radius_error': args.radius_error}
         args.json.write_text(json.dumps({**given, 'limits': variety.LIMITS, 'rows': variety.plain(trials),
                                          'trials': [variety.plain_trial(t) for t in trials]}, indent=1) + '\n')
+    if args.plot:
+        from .plot_confidence import draw    # imports matplotlib
+        draw([a for trial in trials for a in trial.answers.values()], args.plot)
     if args.pictures:
         variety.write_sheets(trials, args.sheets)
+    return 0
+
+
+def _add_judge(commands) -> None:
+    text = 'the model of confidence, made anew: resource/judge.json from every curve that a search tries in seeded scenes'
+    epilog = 'scenes of each family, times N:\n' + '\n'.join(f'  {name:14s} {share:g}' for name, share in judge.FAMILIES.items())
+    command = commands.add_parser('judge', help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument('--scenes', type=count, default=20, metavar='N', help='(default: 20)')
+    command.add_argument('--first-seed', type=natural, default=judge.FIRST_SEED, metavar='SEED', help=f'seeds count up from here (default: {judge.FIRST_SEED}); '
+                         'report on others')
+    command.add_argument('--ct', type=Path, metavar='FILE', help='for ct: a folder with one DICOM series, or NPZ with hu (z, y, x) and spacing_m')
+    command.add_argument('--out', type=Path, default=Path('judge.json'), metavar='FILE', help='(default: judge.json)')
+    workers = command.add_mutually_exclusive_group()
+    _add_jobs(workers)
+    workers.add_argument('--scheduler', metavar='ADDRESS', help='instead: HOST:PORT of a Dask scheduler')
+    command.set_defaults(body=_judge, families=None, open=None)
+
+
+def _judge(args, parser: argparse.ArgumentParser) -> int:
+    """Try everything in all scenes, learn, write the file."""
+    sources = _sources(args, parser)
+    variety.known(sources)
+    _check_files(args.out)
+    if args.scheduler:
+        need('distributed', 'cluster')
+    tasks = judge.tasks(args.scenes, args.first_seed, sources)
+    scenes = list(tqdm(in_order(judge.gather, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene', disable=None))
+    try:
+        content = judge.learn(scenes)
+    except ValueError as error:
+        raise ToolError(str(error)) from error
+    said = f'fluoro_shape_bench judge --scenes {args.scenes} --first-seed {args.first_seed}{" --ct FILE" if args.ct else ""}'
+    args.out.write_text(json.dumps({'made_by': said, **content}, indent=1) + '\n')
+    print(judge.table(judge_of(content), scenes))
     return 0
 
 

@@ -43,6 +43,7 @@ class Answer:
     kind: str = ''                      # of device, where the family has several
     px_m: float = math.nan              # m a pixel at the device, the mean of both planes
     cpu_s: float = math.nan             # of the whole process, all its threads
+    confidence: float = math.nan        # the method's own; of what it refused too
 
     @property
     def published(self) -> bool:
@@ -76,6 +77,7 @@ class Task:
     sources: Sources | None = None      # of a family of `varied`
     base: bool = True                   # whether the base's position is given
     radius_error: float = 0.0           # the radius given is off by this share of the true one
+    min_confidence: float | None = None # instead of the parameter's default
     picture: str = ''                   # which answers of the first method are worth a thumbnail, one of PICTURES; '': none
 
 
@@ -108,7 +110,8 @@ def attempt(task: Task) -> Trial:
     except (ValueError, ImportError) as error:      # ImportError: a renderer is missing here
         raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
     try:
-        answers = {method: answer(case, Config.from_values(method=method), family.device, task.base, task.radius_error) for method in task.methods}
+        least = {} if task.min_confidence is None else {'min_confidence': task.min_confidence}
+        answers = {method: answer(case, Config.from_values(method=method, **least), family.device, task.base, task.radius_error) for method in task.methods}
     except ConfigError as error:    # a radius that no device has
         raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
     first = next(iter(answers.values()))
@@ -136,7 +139,8 @@ def answer(case: Case, config: Config, device: bool = True, base: bool = True, r
 def answer_of(case: Case, result: Reconstruction, device: bool = True) -> Answer:
     """How far off a result for a scene is. `device` False: it shows none, whatever the case says."""
     scene = case.scene
-    found = Answer(scene.seed, result.outcome, device and case.device, note=case.note, detail=result.detail, kind=case.kind, px_m=pixel_size(scene))
+    found = Answer(scene.seed, result.outcome, device and case.device, note=case.note, detail=result.detail, kind=case.kind, px_m=pixel_size(scene),
+                   confidence=result.confidence)
     if result.shape is None or not found.device:
         return found
     shape = result.shape

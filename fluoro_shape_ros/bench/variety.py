@@ -135,7 +135,7 @@ def plain_trial(trial: Trial) -> dict:
 
 def _plain_answer(a: Answer) -> dict:
     return {'outcome': a.outcome.value, 'detail': a.detail, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None, 'surprise': _finite(a.surprise),
-            'right': a.right, 'silent_failure': a.silent_failure, 'cpu_s': _finite(a.cpu_s)}
+            'right': a.right, 'silent_failure': a.silent_failure, 'confidence': _finite(a.confidence), 'cpu_s': _finite(a.cpu_s)}
 
 
 def _finite(number: float) -> float | None:

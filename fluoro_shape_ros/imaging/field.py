@@ -8,15 +8,16 @@ import cv2
 import numpy as np
 
 SHRINK = 4              # the field is found at a quarter of the resolution: two halvings
-DARK = 0.12             # darker than this share of the bright level counts as not exposed ...
+DARK = 0.12, 0.07, 0.04, 0.02   # darker than this share of the bright level counts as not exposed, the first for which the rest is convex ...
 BRIGHT = 0.95           # ... which this share of the pixels does not exceed
 OPENING = 9             # small-image px: a device is thinner, a blade is wider
+CONVEX = 0.975          # share of its convex hull that a field fills: blades and an intensifier leave a convex one open, dense anatomy does not
 
 
 def field_of_view(image: np.ndarray) -> np.ndarray:
     """(H, W) uint8 mask, 255 where the (H, W) image is exposed.
 
-    Unexposed is what is dark, wider than any device and connected with the image's border.
+    Unexposed is what is dark, wider than any device and connected with the image's border, if what it leaves is convex.
     """
     h, w = image.shape
     small = image
@@ -25,18 +26,36 @@ def field_of_view(image: np.ndarray) -> np.ndarray:
     small = small.astype(np.float32)
     small -= min(0.0, float(small.min()))
     some = small.ravel()[::7]
-    dark = (small < DARK * np.partition(some, int(BRIGHT * len(some)))[int(BRIGHT * len(some))]).astype(np.uint8)
+    bright = np.partition(some, int(BRIGHT * len(some)))[int(BRIGHT * len(some))]
+    for share in DARK:
+        blocked = _blocked(small < share * bright)
+        if blocked is None:
+            break
+        if _is_convex(~blocked):
+            return cv2.resize((~blocked).astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_NEAREST)
+    return _open(h, w)
+
+
+def _blocked(dark: np.ndarray) -> np.ndarray | None:
+    """(h, w) bool: what of the (h, w) `dark` is wide and connected with the border; None where nothing is."""
     if not dark.any():
-        return _open(h, w)
-    framed = cv2.copyMakeBorder(dark, OPENING, OPENING, OPENING, OPENING, cv2.BORDER_REPLICATE)
+        return None
+    framed = cv2.copyMakeBorder(dark.astype(np.uint8), OPENING, OPENING, OPENING, OPENING, cv2.BORDER_REPLICATE)
     framed = cv2.morphologyEx(framed, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OPENING, OPENING)))
-    dark = framed[OPENING:-OPENING, OPENING:-OPENING]
-    _, labels = cv2.connectedComponents(dark)
+    _, labels = cv2.connectedComponents(framed[OPENING:-OPENING, OPENING:-OPENING])
     outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     blocked = np.isin(labels, outside[outside > 0])
-    if not blocked.any():
-        return _open(h, w)
-    return cv2.resize((~blocked).astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_NEAREST)
+    return blocked if blocked.any() else None
+
+
+def _is_convex(lit: np.ndarray) -> bool:
+    """Whether an (h, w) bool region fills its convex hull."""
+    v, u = np.nonzero(lit)
+    if not len(u):
+        return False
+    hull = np.zeros(lit.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([u, v], axis=1).astype(np.int32)), 1)
+    return bool(len(u) > CONVEX * np.count_nonzero(hull))
 
 
 @lru_cache(8)

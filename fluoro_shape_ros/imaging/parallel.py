@@ -7,9 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 FEW = 2**19     # pixels of both planes that are worked on sooner than handed to a thread
 
-_pool = ThreadPoolExecutor(2, 'plane')      # starts its threads when they are first needed
+_other = ThreadPoolExecutor(1, 'plane')     # its thread is started when it is first needed
 
 
 def both(work: Callable, *arguments, pixels: int) -> tuple:
     """What `work` gives for plane A and for plane B; each of `arguments` holds one of each. pixels: how many it works on, in all."""
-    return tuple((_pool.map if pixels > FEW else map)(work, *arguments))
+    *others, last = zip(*arguments)
+    if pixels <= FEW:
+        return (*(work(*o) for o in others), work(*last))
+    handed = [_other.submit(work, *o) for o in others]
+    own = work(*last)
+    return (*(h.result() for h in handed), own)

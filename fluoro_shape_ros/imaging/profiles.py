@@ -10,9 +10,6 @@ from ..geometry.curve import middle
 
 BLUR_PX = 1.0           # of an image, beside the device's own shape
 PIECE = 31              # strips
-STRETCH = 3             # pieces: longer than what hides a device
-OPAQUE = 0.5            # contrast of a device that hardly lets anything through
-LAST = 2                # pieces at an end that must be about as dark as the others
 OUTER = 0.02            # of a shadow: what is fainter lies beside the device
 USUAL_WIDTH = 0.88      # of a device whose radius is known, since most images are sharper than BLUR_PX
 WIDER_PX, NARROWER_PX = 0.5, 0.7        # what that may be off by
@@ -49,13 +46,6 @@ def apparent_width(alike: list[np.ndarray]) -> tuple[float, np.ndarray]:
     typical = np.stack([middle(a, axis=0) if len(a) else np.zeros(len(WIDTHS)) for a in alike])
     best = int(typical.min(axis=0).argmax())
     return float(WIDTHS[best]), typical[:, best]
-
-
-def best_of_worst(alike: np.ndarray) -> float:
-    """Of (B,) likenesses of successive pieces the best of the STRETCH worst ones in a row: low only where a line looks like nothing round for long."""
-    if len(alike) < STRETCH:
-        return float(alike.max(initial=0.0))
-    return float(np.max([alike[k:len(alike) - STRETCH + 1 + k] for k in range(STRETCH)], axis=0).min())
 
 
 def odd_width(width: float, half_width_px: float) -> float:
@@ -112,19 +102,6 @@ def contrast_of(profiles: np.ndarray) -> np.ndarray:
 def straight_on(contrast: np.ndarray, sine: np.ndarray) -> np.ndarray:
     """What the contrast of a device would be if it were not seen at an angle, of this sine, to its axis (Beer-Lambert)."""
     return 1 - (1 - contrast) ** np.clip(sine, 0.2, 1)
-
-
-def fading(profiles: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """(2,) logarithm of the darkness of the first and the last pieces, the darker of LAST, as a share of the usual one, of a device's (B, W) profiles.
-
-    A translucent device takes the same share of the beam everywhere, whatever lies behind it, and an opaque one nearly all of it, at whatever angle it is
-    seen; the edge of a bone, taken for it, does not.
-    """
-    if len(profiles) <= 2 * LAST:
-        return np.zeros(2)
-    contrast = contrast_of(profiles)
-    dark = np.log(np.clip(contrast if middle(contrast) > OPAQUE else straight_on(contrast, sine), 1e-3, 1))
-    return np.maximum([dark[:LAST].max(), dark[-LAST:].max()] - middle(dark), -2.0)
 
 
 def own_shadow(profiles: np.ndarray, beside: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:

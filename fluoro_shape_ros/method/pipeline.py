@@ -1,37 +1,34 @@
-"""A pair of images walks straight through: prepare, find and fit the device, decide the tip, doubt, answer."""
+"""A pair of images walks straight through: prepare, propose, fit, judge, decide the tip, answer."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
-import cv2
 import numpy as np
 
-from . import paper
 from ..config import Config
-from ..geometry.curve import arc_length, distance_to, even_steps, middle, resample
 from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
-from .detect import Detection, detect, found_near, track
-from .tip import tip_is_last
+from ..geometry.cameras import GeometryError, check, distort, pixels_per_metre, project, undistort
+from ..geometry.curve import arc_length, distance_to, resample
 from ..imaging.field import border_distance, field_of_view
-from .fit.fit import Fit
-from .propose.follow import reach_px
-from ..geometry.cameras import GeometryError, calibration_covariance, check, crop, distort, pixels_per_metre, project, undistort
 from ..imaging.mask import subtract
-from .propose.motion import going_on
-from .plausibility import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from ..imaging.parallel import both
-from .prediction import Guess, borne_out, informed, judged, look
+from ..imaging.prepare import dark_device, sheet_of
 from ..imaging.strips import Sheet
+from . import judge, paper
+from .backbone import backbone
+from .checks import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
+from .features import MEAN, MEAN_PX, TIP, TIP_PX, features
+from .fit.fit import Fit, fit
+from .near import Near, predicted, tracked
+from .prediction import Guess, borne_out, informed, judged, look
+from .search import Attempt, choose, projected, tries
+from .tip import tip_of
 
-REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next ...
-EDGE_PX = 30            # ... and where it ends this near to the region's edge, it may go on
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
-CALIBRATION_PX = 0.25   # what the best calibration of a plane is worth
-SOME = 12               # points of a backbone at which that is worked out ...
-AROUND = 12             # ... with so many strips around each, that tell whether the device lies beside the curve there
-WHOLE = slice(None), slice(None)    # rows and columns of an image
 
 
 def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconstruction:
@@ -51,42 +48,70 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
 
 def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
     """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images."""
-    radius, polarity = config.detection.robot_radius, config.detection.polarity
-    near = []       # what is found near where it was, or should be
-    if config.curve.tracking and prior.previous is not None:
-        expected = going_on(prior, frame.stamp_ns)
-        for points, coarse in ((expected, None), (prior.previous.points, 1)):
-            if points is not None and not near:
-                around = [region_around(v, points) for v in frame.views]
-                near += _near(around, track, images, fields, frame.views, polarity, radius, config.detection.min_length_px, points, coarse, guess)
-        clock.lap('track')
-    if guess is not None and not any(d.sure and borne_out(d.fit.curve(100), guess) for d in near):
-        around = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
-        near += _near(around, found_near, images, fields, frame.views, polarity, radius, config.detection.min_length_px, guess)
-        clock.lap('follow')
-    found = next((d for d in reversed(near) if d.sure), None)
-    if found is None:
-        found = detect(_sheet(images, fields, frame.views, polarity), radius, config.detection.min_length_px, guess, [d.fit for d in near])
-        clock.lap('detect')
-    seen = tuple(None if px is None else Centerline(px) for px in found.seen_px)
-    if found.fit is None:
-        return Reconstruction(found.outcome, found.detail, centerlines=seen, stage_seconds=clock.laps)
+    radius, polarity, least = config.detection.robot_radius, config.detection.polarity, config.plausibility.min_confidence
+    enough = max(least, judge.BEYOND_DOUBT)
+    tip = partial(_tip, frame, fields, config, prior, guess)
+    model = judge.load()
 
-    f = found.fit
+    def sized_up(sheet: Sheet, f: Fit) -> tuple[np.ndarray, float, bool]:
+        """Features of a fit and its log odds, for which a prediction that it bears out speaks; and whether its last end is the tip."""
+        last, _ = tip(f)
+        seen = features(f, sheet, radius, last)
+        return seen, float(model.log_odds(seen)) + (judge.PREDICTED if guess is not None and borne_out(f.curve(100), guess) else 0.0), last
+
+    leads, chosen, lines = [], None, ()
+    for n in _near(frame, images, fields, config, prior, guess, clock):
+        attempt = Attempt(n.fit, (None, None), *sized_up(n.sheet, n.fit))
+        if n.alone and model.settles(attempt.log_odds, enough) and (guess is None or borne_out(n.fit.curve(100), guess)):
+            chosen, p = attempt, judge.probability(attempt.log_odds)
+            break
+        leads.append(n.fit)
+    if chosen is None:
+        sheet = sheet_of(images, fields, frame.views, polarity)
+        tried, lines = tries(sheet, radius, config.detection.min_length_px, partial(sized_up, sheet), lambda odds: model.settles(odds, enough),
+                             guess, leads)
+        clock.lap('search')
+        if not tried:
+            return _nothing(lines, config, clock)
+        chosen, p = choose(tried)
+
+    f, confidence = chosen.fit, model.confidence(p)
+    if confidence < min(least, 0.5) and any(line is None for line in lines):     # rather wrong than right
+        return replace(_nothing(lines, config, clock), confidence=confidence)
+    seen = tuple(Centerline(projected(f, v) if c is None else c.points_px) for v, c in zip(frame.views, chosen.lines))
+    last, guessed = tip(f)
     if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)
-    ends = f.spline(np.array([f.start, f.stop]))
-    known = _known_order(f.curve(100), prior, guess)
-    forward, guessed = _tip_rule(ends, tuple(f.open_end), frame.views, fields, config, known)
-    shape = backbone(f, frame.views, forward, config.curve.backbone_spacing)
+    shape = backbone(f, frame.views, last, config.curve.backbone_spacing)
     clock.lap('backbone')
-    metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
-    doubt = (found.doubt or check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
-             or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
-    clock.lap('plausibility')
+    doubt = (Outcome.LOW_CONFIDENCE, model.why(chosen.features, chosen.log_odds, p)) if confidence < least else _doubt(shape, config, frame)
     if doubt:
-        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps)
-    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps)
+        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence)
+    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence)
+
+
+def _near(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Iterator[Near]:
+    """The device where it was, or should be by now, then where a prediction has it."""
+    here = frame, images, fields, config.detection.polarity, config.detection.robot_radius
+    if config.curve.tracking and prior.previous is not None:
+        found = tracked(*here, prior)
+        clock.lap('track')
+        if found is not None:
+            yield found
+    if guess is not None:
+        found = predicted(*here, guess)
+        clock.lap('follow')
+        if found is not None:
+            yield found
+
+
+def _nothing(lines, config: Config, clock: _Stopwatch) -> Reconstruction:
+    """The answer where no curve was found that both planes show."""
+    seen = tuple(None if px is None else Centerline(px) for px in lines)
+    for px, outcome in zip(lines, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
+        if px is None:
+            return Reconstruction(outcome, f'no line of at least {config.detection.min_length_px:g} px stands out', centerlines=seen, stage_seconds=clock.laps)
+    return Reconstruction(Outcome.NO_CORRESPONDENCE, 'no line of plane a is one of plane b', centerlines=seen, stage_seconds=clock.laps)
 
 
 def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
@@ -107,8 +132,7 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
 
     best = max(curves, key=lambda c: arc_length(c)[-1])
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, best) for v in frame.views])
-    forward, guessed = _tip_rule(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config,
-                                 _known_order(best, prior, guess))
+    forward, guessed = tip_of(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, _known_order(best, prior, guess))
     points, s = resample(best if forward else best[::-1], config.curve.backbone_spacing)
     residuals = residuals_px(points, frame.views, seen)
     clock.lap('curve')
@@ -116,108 +140,36 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
     doubt = (check_curvature(curves, curvature_limit(config, metres_per_px)) or check_length(s[-1], config)
              or check_reprojection(residuals, config))
     clock.lap('plausibility')
+    confidence = _confidence_of(points, sheet_of(images, fields, frame.views, 'dark'), config)
     if doubt:
-        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps)
+        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence)
     shape = Shape(points, s, np.full((len(points), 3, 3), np.nan), residuals)   # the published method knows no covariance
-    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps)
+    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence)
 
 
-def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
-    """The fitted spline at equal arc-length steps from base to tip, with the covariance of each point.
-
-    Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of the end. What the calibration is
-    worth adds to both: the images can't tell that they lie a little beside where it says. Where the strips around a point agree that the device lies beside
-    the curve, as along the edge of a bone, that counts as much as if the calibration were off by it.
-    """
-    u = np.linspace(f.start, f.stop, max(int((f.stop - f.start) / 5e-4), 50))
-    if not forward:
-        u = u[::-1]
-    along = arc_length(f.spline(u))
-    s = even_steps(along[-1], step)
-    at = np.interp(s, along, u)
-    basis, slope = f.spline.bases(at, 0, 1)
-    points, tangents = basis @ f.spline.control, slope @ f.spline.control
-    n = len(f.spline.control)
-    half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
-    near, weights = f.spline.weights(at, 0)
-    covariance = np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near]) + _displaced(f, views, points, tangents, at)
-    tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
-    sigma = f.end_sigma if forward else f.end_sigma[::-1]
-    covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
-    known = [np.isfinite(o) for o in f.offset_px.T]
-    residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan) if k.any() else np.full(len(at), np.nan)
-                          for o, k in zip(f.offset_px.T, known)], axis=1)
-    return Shape(points, s, covariance, residuals)
+def _confidence_of(points: np.ndarray, sheet: Sheet, config: Config) -> float:
+    """The probability that a backbone (N, 3) of dark devices is right, which a fit did not make: that of the fit which begins there, if they are one curve."""
+    f = fit(sheet, points, config.detection.robot_radius, 1)
+    if f is None:
+        return 0.0
+    model, ends = judge.load(), f.curve(2)
+    last = bool(np.linalg.norm(ends[1] - points[-1]) < np.linalg.norm(ends[0] - points[-1]))
+    px = f.s[1] - f.s[0]
+    if distance_to(points, f.curve(400)).mean() > max(MEAN, MEAN_PX * px) or np.linalg.norm(ends[int(last)] - points[-1]) > max(TIP, TIP_PX * px):
+        return 0.0
+    return model.confidence(judge.probability(float(model.log_odds(features(f, sheet, config.detection.robot_radius, last)))))
 
 
-def _displaced(f: Fit, views, points: np.ndarray, tangents: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) m^2 that planes displaced by the calibration's errors, or by what the fit leaves over, add to (N, 3) points at (N,) arc lengths.
-
-    Between SOME of them it changes evenly.
-    """
-    k = np.linspace(0, len(points) - 1, SOME).round().astype(int)
-    first = np.searchsorted(f.s, np.clip(s[k], f.start, f.stop)) - AROUND // 2
-    lowest, highest = np.searchsorted(f.s, [f.start, f.stop]) + [0, -AROUND]
-    first = np.clip(first, lowest, max(highest, lowest))
-    around = f.offset_px[np.minimum(first[:, None] + np.arange(AROUND), len(f.s) - 1)]       # (SOME, AROUND, 2)
-    left = np.abs(middle(np.where(np.isfinite(around), around, 0.0), axis=1)).max(axis=1)
-    some = calibration_covariance(views, points[k], tangents[k], np.hypot(CALIBRATION_PX, left))
-    at = np.interp(np.arange(len(points)), k, np.arange(SOME))
-    return (np.maximum(1 - np.abs(at[:, None] - np.arange(SOME)), 0) @ some.reshape(SOME, 9)).reshape(-1, 3, 3)
+def _doubt(shape: Shape, config: Config, frame: Frame) -> tuple[Outcome, str] | None:
+    """What a user has set a bound to, if the backbone is beyond it."""
+    metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
+    return (check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
+            or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
 
 
-def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
-    """The (H, W) image as float32, not negative, with a device that is darker than its surroundings; polarity is settled here and nowhere else."""
-    full = float(np.iinfo(image.dtype).max) if image.dtype.kind == 'u' else None
-    image = image.astype(np.float32)
-    if full is None:
-        low, high = float(image.min()), float(image.max())
-        image, full = image - min(low, 0.0), high - min(low, 0.0)
-    if polarity == 'auto':
-        # a thin device is a rare deviation from the local level: the longer tail tells its sign
-        detail = image - cv2.blur(image, (31, 31))
-        polarity = 'bright' if np.mean(detail**3) > 0 else 'dark'
-    return full - image if polarity == 'bright' else image
-
-
-def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice], out: np.ndarray) -> None:
-    """Write the square root of the `region` of a dark device's (H, W) image to `out`, float32: quantum noise gets the same variance everywhere (Anscombe)."""
-    if image.dtype.kind == 'u' and polarity == 'dark':
-        np.sqrt(image[region], out=out, dtype=np.float32)
-    elif image.dtype.kind == 'u' and polarity != 'auto':
-        np.sqrt(dark_device(image[region], polarity), out=out)
-    else:       # needs the whole image's statistics
-        np.sqrt(dark_device(image, polarity)[region], out=out)
-
-
-def _sheet(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Sheet:
-    """Both planes' images, or a region of each, as the method wants them."""
-    parts = [crop(v, *r) for v, r in zip(views, regions)] if regions != (WHOLE, WHOLE) else views
-    return Sheet.of(list(zip(images, regions)), [f[r] for f, r in zip(fields, regions)], parts, lambda i, out: stable_noise(i[0], polarity, i[1], out))
-
-
-def _near(regions, look, images, fields, views, polarity: str, *known) -> list[Detection]:
-    """What `look` finds in these regions of both planes; nothing where it may go on beyond them."""
-    found = look(_sheet(images, fields, views, polarity, regions), *known)
-    if found is None:
-        return []
-    seen = []
-    for (rows, columns), view, line in zip(regions, views, found.seen_px):
-        last = np.array([columns.stop - columns.start, rows.stop - rows.start])
-        cut_off = np.array([columns.start, rows.start]) > 0, np.array([columns.stop, rows.stop]) < [view.width, view.height]
-        ends = line[[0, -1]]
-        if ((ends < EDGE_PX) & cut_off[0] | (ends > last - EDGE_PX) & cut_off[1]).any():
-            return []
-        seen.append(line + [columns.start, rows.start])
-    return [replace(found, seen_px=tuple(seen))]
-
-
-def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:
-    """Rows and columns of the image within `margin_px` of the projections of (N, 3) points."""
-    uv = distort(view, project(view.P, points))
-    low = np.clip(np.floor(uv.min(axis=0)) - margin_px, 0, [view.width - 1, view.height - 1]).astype(int)
-    high = np.clip(np.ceil(uv.max(axis=0)) + margin_px, 1, [view.width, view.height]).astype(int)
-    return slice(low[1], high[1]), slice(low[0], high[0])
+def _tip(frame: Frame, fields, config: Config, prior: Prior, guess: Guess | None, f: Fit) -> tuple[bool, bool]:
+    """Whether the last end of a fit is the tip, and whether that is a guess."""
+    return tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config, _known_order(f.curve(100), prior, guess))
 
 
 def residuals_px(points: np.ndarray, views, centerlines) -> np.ndarray:
@@ -246,13 +198,6 @@ def _known_order(points: np.ndarray, prior: Prior, guess: Guess | None) -> np.nd
     if prior.previous is not None:
         return prior.previous.points
     return guess.points if guess is not None and borne_out(points, guess) else None
-
-
-def _tip_rule(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, known: np.ndarray | None) -> tuple[bool, bool]:
-    """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
-    def border_px() -> np.ndarray:
-        return np.stack([border_distance(f, distort(v, project(v.P, ends))) for f, v in zip(fields, views)], axis=1)
-    return tip_is_last(ends, at_border, border_px, config.curve.base_position, known)
 
 
 class _Stopwatch:

@@ -6,6 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..config import Config
+from ..geometry.cameras import distort, project
+from ..imaging.field import border_distance
+
 
 def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Callable[[], np.ndarray], base_position=(),
                 previous: np.ndarray | None = None) -> tuple[bool, bool]:
@@ -28,3 +32,10 @@ def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Calla
     # farther from the border in both planes; where the planes contradict each other the nearer border of both decides
     nearest = border_px().min(axis=1)
     return bool(nearest[1] >= nearest[0]), True
+
+
+def tip_of(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, known: np.ndarray | None) -> tuple[bool, bool]:
+    """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
+    def border_px() -> np.ndarray:
+        return np.stack([border_distance(f, distort(v, project(v.P, ends))) for f, v in zip(fields, views)], axis=1)
+    return tip_is_last(ends, at_border, border_px, config.curve.base_position, known)

@@ -28,6 +28,7 @@ class Row:
     tip: tuple[float, float, float] = NONE  # m
     sigma: float = float('nan')             # of the tip in its worst direction, m
     residual_px: tuple[float, float] = NONE[:2]     # median distance of the reprojected backbone to the centreline seen in plane A, B
+    confidence: float = float('nan')        # of a rejected pair too
 
     @property
     def error_px(self) -> float:
@@ -76,7 +77,8 @@ class History:
 def row_of(answer: Answer) -> Row:
     """The numbers of an answer."""
     result, shape = answer.result, answer.result.shape
-    row = Row(answer.job.stamp_ns, result.outcome.value, '' if result.outcome is Outcome.OK else result.detail, result.warnings, answer.seconds)
+    row = Row(answer.job.stamp_ns, result.outcome.value, '' if result.outcome is Outcome.OK else result.detail, result.warnings, answer.seconds,
+              confidence=result.confidence)
     if shape is None:
         return row
     residuals = tuple(float(np.median(column[~np.isnan(column)])) if not np.isnan(column).all() else float('nan') for column in shape.residuals_px.T)

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from msg_adapters import shapes
-from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, diagnostic_array
+from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, diagnostic_array, probability
 
 from ..config import Config, ConfigError
 from ..data import Outcome
@@ -26,11 +26,11 @@ from .parameters import NODE, read_parameters
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 DIAGNOSTICS = '/diagnostics'
-RESULTS = {     # topic -> type, adapter
-    'backbone': ('nav_msgs/msg/Path', None),    # is serialised at once
-    'tip': ('geometry_msgs/msg/PointStamped', shapes.shape_to_tip),
-    'tip_pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', shapes.shape_to_tip_pose),
-    'backbone_points': ('sensor_msgs/msg/PointCloud2', shapes.shape_to_cloud),
+RESULTS = {     # topic -> type
+    'backbone': 'nav_msgs/msg/Path',
+    'tip': 'geometry_msgs/msg/PointStamped',
+    'tip_pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'backbone_points': 'sensor_msgs/msg/PointCloud2',
 }
 INPUTS = tuple(f'plane_{plane}/{what}' for plane in PLANES for what in ('image_raw', 'camera_info'))
 
@@ -200,25 +200,24 @@ class Results:
     """The bag with the results (of create_bag): one diagnostics message a pair, and the shape where there is one."""
 
     def __init__(self, out, names: dict[str, str]):
-        self._out = out
-        self._backbone = names['backbone']
-        self._adapters = {names[name]: adapter for name, (_, adapter) in RESULTS.items() if adapter}
-        for name, (kind, _) in RESULTS.items():
+        self._out, self._names = out, names
+        for name, kind in RESULTS.items():
             out.declare(names[name], kind)
         out.declare(DIAGNOSTICS, 'diagnostic_msgs/msg/DiagnosticArray')
 
     def take(self, answer: Answer) -> None:
         """Write the result of a pair."""
-        out, result, stamp = self._out, answer.result, answer.job.stamp_ns
+        out, names, result, stamp, frame_id = self._out, self._names, answer.result, answer.job.stamp_ns, answer.job.frame_id
         level = ERROR if result.outcome in FAULTS else WARN if result.outcome is not Outcome.OK or result.warnings else OK
         reason = ': '.join(filter(None, (result.outcome.value, result.detail)))
-        status = Status('reconstruction', level, '; '.join((reason, *result.warnings)),
-                        {'last outcome': result.outcome.value, 'last detail': result.detail, 'warnings': ', '.join(result.warnings)})
+        status = Status('reconstruction', level, '; '.join((reason, *result.warnings)), {
+            'last outcome': result.outcome.value, 'last detail': result.detail, 'confidence': probability(result.confidence), 'warnings': ', '.join(result.warnings)})
         out.write(DIAGNOSTICS, diagnostic_array([status], stamp, NODE, out.new), stamp)
         if result.shape is not None:
-            out.write_raw(self._backbone, shapes.shape_to_path_cdr(result.shape, stamp, answer.job.frame_id), stamp)
-            for topic, adapter in self._adapters.items():
-                out.write(topic, adapter(result.shape, stamp, answer.job.frame_id, out.new), stamp)
+            out.write_raw(names['backbone'], shapes.shape_to_path_cdr(result.shape, stamp, frame_id), stamp)
+            out.write(names['tip'], shapes.shape_to_tip(result.shape, stamp, frame_id, out.new), stamp)
+            out.write(names['tip_pose'], shapes.shape_to_tip_pose(result.shape, stamp, frame_id, out.new), stamp)
+            out.write(names['backbone_points'], shapes.shape_to_cloud(result.shape, result.confidence, stamp, frame_id, out.new), stamp)
 
     def close(self) -> None:
         """Nothing is left to do: the bag is closed by who made it."""

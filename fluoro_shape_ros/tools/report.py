@@ -49,7 +49,7 @@ def page_data(history: History, offline: Offline, name: str) -> dict:
         't': numbers([(r.stamp_ns - begin) / 1e9 for r in rows], 4), 'outcome': [', '.join((r.outcome, *r.warnings)) for r in rows],
         'detail': [r.detail for r in rows], 'ms': numbers([r.seconds * 1e3 for r in rows], 2), 'length': numbers([r.length * 1e3 for r in rows], 2),
         'sigma': numbers([r.sigma * 1e3 for r in rows], 3), 'tip': [numbers([r.tip[axis] * 1e3 for r in rows], 2) for axis in range(3)],
-        'residual_px': [numbers([r.residual_px[plane] for r in rows], 3) for plane in range(2)],
+        'residual_px': [numbers([r.residual_px[plane] for r in rows], 3) for plane in range(2)], 'confidence': numbers([r.confidence for r in rows], 3),
         'kept': [k for k, _ in kept], 'unit': 1e3 / UNIT, 'shapes': [None if shape is None else curve(shape) for _, shape in kept],
         'overlays': [o for o in (picture(*entry, offline) for entry in (('worst answered', history.worst), ('median', history.median),
                                                                         ('first unanswered', history.unanswered))) if o],

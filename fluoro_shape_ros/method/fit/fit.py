@@ -17,8 +17,7 @@ from .ends import BLURS_PX, End, bulge, locate, supported
 from ...geometry.cameras import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from ...geometry.spline import Spline3, prolong, through
-from ...imaging.profiles import (OPAQUE, PIECE, WIDTHS, apparent_width, background, best_of_worst, contrast_of, fading, likeness, mean_profile, odd_width, own_shadow,
-                       pieces, shadow, straight_on)
+from ...imaging.profiles import background, contrast_of, mean_profile, own_shadow, shadow, straight_on
 from ...imaging.strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
@@ -34,9 +33,6 @@ GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how m
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
-ROUND = 0.99            # likeness of an opaque line that is a device, whatever its width
-MEDIAN = np.sqrt(np.pi / 2 / PIECE)     # standard deviation of the median of a piece's samples, as a share of theirs
-END_PX = 24             # of the device, that must show it
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther ...
 GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
@@ -59,15 +55,9 @@ class Fit:
     s: np.ndarray               # (N,) m
     presence: np.ndarray        # (N, 2)
     offset_px: np.ndarray       # (N, 2) of the device from the fitted curve; NaN where not measured
-    contrast: np.ndarray        # (2,) share of the beam that the device takes at its middle, after blur
-    across: np.ndarray          # (2,) the same as if seen straight on, by Beer-Lambert
-    width: float                # how many times as wide as a cylinder of robot_radius it looks
-    odd_width: float            # by how much that is more than usual, see profiles.odd_width
-    likeness: np.ndarray        # (2,) correlation of its profile with that of a cylinder so wide
-    weakest: np.ndarray         # (2,) the same where it looks least like one, see profiles.best_of_worst
+    across: np.ndarray          # (2,) share of the beam that the device takes at its middle, after blur, as if seen straight on (Beer-Lambert)
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
-    fading: np.ndarray          # (2,) logarithm of how dark both planes show its last stretch at each end, beside the rest of it, see profiles.fading
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
     moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not come to rest
 
@@ -267,12 +257,6 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
     contrast = contrast_of(np.stack(profile))
     scale = np.array(half_width) / radius
     across = straight_on(contrast, middle(strips.speed[:, between]) / scale)
-    parts = [pieces(np.column_stack([p, v]), between & i)[0] for p, v, i in zip(strips.profiles, strips.speed, strips.inside)]
-    each = [likeness(p[:, :-1], h, MEDIAN * n) for p, h, n in zip(parts, half_width, seen.noise)]
-    width, alike = apparent_width(each)
-    weakest = np.array([best_of_worst(a[:, WIDTHS == width].ravel()) for a in each])
-    opaque = contrast.min() > OPAQUE and alike.min() > ROUND      # no rib, vessel or lead: then robot_radius is wrong, not the line
-    odd = 0.0 if opaque else odd_width(width, float(np.mean(half_width)))
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])     # it runs out of a field before its end
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
@@ -284,8 +268,7 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-               contrast, across, width, odd, alike, weakest, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
-               np.where(open_end, 0.0, sum(fading(p[:, :-1], p[:, -1] / k) for p, k in zip(parts, scale))), np.full(2, -1), solution.moved_px), ends
+               across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside), np.full(2, -1), solution.moved_px), ends
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -326,21 +309,3 @@ def _shown_by_one(f: Fit) -> np.ndarray:
 def crowded(f: Fit) -> np.ndarray:
     """(2,) bool: whether both planes show something beside where the first and the last end would go on."""
     return f.aside.min(axis=1) > CROWDED
-
-
-def shown(f: Fit) -> np.ndarray:
-    """(2,) share of the device's length that each plane shows."""
-    between = (f.s > f.start) & (f.s < f.stop)
-    return (f.presence[between] > 0.4).mean(axis=0) if between.any() else np.zeros(2)
-
-
-def contrast_ratio(f: Fit) -> float:
-    """How many times as dark one plane shows the device as the other, at least 1: as seen for an opaque device, as if straight on for a translucent one."""
-    return float(min(c.max() / max(c.min(), 1e-6) for c in (f.contrast, f.across)))
-
-
-def ends_shown(f: Fit) -> np.ndarray:
-    """(2, 2) presence of the device in its last END_PX, first and last end (rows), plane A, B; 1 where it leaves the field."""
-    px = END_PX * (f.s[1] - f.s[0])
-    last = [f.presence[(f.s > low) & (f.s < high)] for low, high in ((f.start, f.start + px), (f.stop - px, f.stop))]
-    return np.stack([np.ones(2) if leaves or not len(p) else np.minimum(np.fmax(p, 0), 1).mean(axis=0) for p, leaves in zip(last, f.open_end)])

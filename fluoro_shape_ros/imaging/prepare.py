@@ -1,0 +1,50 @@
+"""Images as the method wants them: the device dark, noise even, both planes on one sheet, and no more of them than is needed."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from ..geometry.cameras import crop, distort, project
+from .strips import Sheet
+
+REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next
+WHOLE = slice(None), slice(None)    # rows and columns of an image
+
+
+def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
+    """The (H, W) image as float32, not negative, with a device that is darker than its surroundings; polarity is settled here and nowhere else."""
+    full = float(np.iinfo(image.dtype).max) if image.dtype.kind == 'u' else None
+    image = image.astype(np.float32)
+    if full is None:
+        low, high = float(image.min()), float(image.max())
+        image, full = image - min(low, 0.0), high - min(low, 0.0)
+    if polarity == 'auto':
+        # a thin device is a rare deviation from the local level: the longer tail tells its sign
+        detail = image - cv2.blur(image, (31, 31))
+        polarity = 'bright' if np.mean(detail**3) > 0 else 'dark'
+    return full - image if polarity == 'bright' else image
+
+
+def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice], out: np.ndarray) -> None:
+    """Write the square root of the `region` of a dark device's (H, W) image to `out`, float32: quantum noise gets the same variance everywhere (Anscombe)."""
+    if image.dtype.kind == 'u' and polarity == 'dark':
+        np.sqrt(image[region], out=out, dtype=np.float32)
+    elif image.dtype.kind == 'u' and polarity != 'auto':
+        np.sqrt(dark_device(image[region], polarity), out=out)
+    else:       # needs the whole image's statistics
+        np.sqrt(dark_device(image, polarity)[region], out=out)
+
+
+def sheet_of(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Sheet:
+    """Both planes' images, or a region of each, as the method wants them."""
+    parts = [crop(v, *r) for v, r in zip(views, regions)] if regions != (WHOLE, WHOLE) else views
+    return Sheet.of(list(zip(images, regions)), [f[r] for f, r in zip(fields, regions)], parts, lambda i, out: stable_noise(i[0], polarity, i[1], out))
+
+
+def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:
+    """Rows and columns of the image within `margin_px` of the projections of (N, 3) points."""
+    uv = distort(view, project(view.P, points))
+    low = np.clip(np.floor(uv.min(axis=0)) - margin_px, 0, [view.width - 1, view.height - 1]).astype(int)
+    high = np.clip(np.ceil(uv.max(axis=0)) + margin_px, 1, [view.width, view.height]).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])

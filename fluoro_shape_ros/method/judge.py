@@ -1,0 +1,97 @@
+"""How likely a fitted curve is right: one calibrated model of what the images say of it, and the words for what speaks against it.
+
+Logistic regression (Cox 1958) on how much worse each feature x is than it typically is of right curves, in scales that they differ by,
+
+    u_k = min(max(sign_k (typical_k - x_k) / scale_k, 0), LIMIT)
+    ln odds = bias - sum_k (near_k max(u_k - NEAR, 0) + far_k max(u_k - FAR, 0)),     near_k, far_k >= 0,
+
+so that nothing makes up for what speaks against a curve: a tip that is uncertain stays so however dark the device is.
+The coefficients stand in resource/judge.json, made by `fluoro_shape_bench judge` from seeded scenes that are named there. The best of several curves is
+right with the probability that `search.choose` gives, once more calibrated: ln odds -> offset + slope ln odds (Platt 1999).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..resources import resource_path
+from .features import NAMES
+
+BEYOND_DOUBT = 0.97     # confidence from which on nothing else is tried, unless min_confidence asks for more
+PREDICTED = 1.0         # what a prediction that a curve bears out adds to its log odds
+NEAR, FAR, LIMIT = 0.7, 2.0, 6.0        # scales: what is worse by less says nothing, by more it says more, and in the end no more
+# +1: the more the likelier it is right, -1: the less
+SIGNS = dict(weakest=1, seen=1, symmetric=-1, width=-1, residual=-1, sigma=-1, tip_stops=1, tip_shown=1, tip_sigma=-1,
+             tip_aside=-1, no_tip=-1, length=1, hidden=-1)
+REASONS = dict(
+    weakest='part of it hardly stands out from what lies beside it',
+    seen='one plane does not show all of it', symmetric='one side of it is darker than the other, as at an edge',
+    width='it looks wider or narrower than robot_radius', residual='the planes disagree where it runs', sigma='its course is uncertain',
+    tip_stops='one plane shows it going on past its tip', tip_shown='one plane hardly shows its tip', tip_sigma='where its tip is, is uncertain',
+    tip_aside='a line goes on beside its tip',
+    no_tip='it leaves the field at both ends',
+    length='it is short',
+    hidden='only one plane shows one of its ends')
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The calibrated model; arrays in the order of features.NAMES."""
+
+    bias: float
+    typical: np.ndarray
+    scale: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    offset: float
+    slope: float
+
+    def terms(self, features: np.ndarray) -> np.ndarray:
+        """(..., len(NAMES)) what each feature adds to the log odds."""
+        beyond_near, beyond_far = worse(features, self.typical, self.scale)
+        return -(self.near * beyond_near + self.far * beyond_far)
+
+    def log_odds(self, features: np.ndarray) -> np.ndarray:
+        """(...) of (..., len(NAMES)) features: that one curve alone is right."""
+        return self.bias + self.terms(features).sum(axis=-1)
+
+    def confidence(self, probability: float) -> float:
+        """The calibrated probability that the chosen one of several curves is right."""
+        p = np.clip(probability, 1e-12, 1 - 1e-12)
+        return float(1 / (1 + np.exp(-(self.offset + self.slope * np.log(p / (1 - p))))))
+
+    def settles(self, log_odds: float, least: float) -> bool:
+        """Whether a curve with these odds, if nothing else is found, has at least the confidence `least`."""
+        return self.confidence(probability(log_odds)) >= least
+
+    def why(self, features: np.ndarray, log_odds: float, p: float) -> str:
+        """What speaks most against a curve with these odds that has the probability `p` beside others, in words."""
+        if p < 0.5 * probability(log_odds):
+            return 'another curve explains both images about as well'
+        return REASONS[NAMES[int(self.terms(features).argmin())]]
+
+
+def worse(features: np.ndarray, typical: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(..., len(NAMES)) scales by which features are worse than typical ones, beyond NEAR and beyond FAR."""
+    u = np.clip(np.array([SIGNS[name] for name in NAMES]) * (typical - features) / scale, 0, LIMIT)
+    return np.maximum(u - NEAR, 0), np.maximum(u - FAR, 0)
+
+
+def probability(log_odds: float) -> float:
+    return float(1 / (1 + np.exp(-np.clip(log_odds, -30, 30))))
+
+
+@lru_cache(1)
+def load() -> Judge:
+    """The judge of the package."""
+    return judge_of(json.loads(resource_path('judge.json').read_text(encoding='utf-8')))
+
+
+def judge_of(content: dict) -> Judge:
+    """The judge that a file's content describes."""
+    terms = [content['features'][name] for name in NAMES]
+    return Judge(content['bias'], *(np.array([t[key] for t in terms]) for key in ('typical', 'scale', 'near', 'far')), content['offset'], content['slope'])

@@ -1,0 +1,222 @@
+"""What the images say of a fit: the same on any display, from either side, in either order; worse where the fit is."""
+
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from fluoro_shape_ros.geometry.cameras import project
+from fluoro_shape_ros.geometry.curve import arc_length, resample
+from fluoro_shape_ros.geometry.spline import through
+from fluoro_shape_ros.imaging.field import field_of_view
+from fluoro_shape_ros.imaging.prepare import sheet_of
+from fluoro_shape_ros.method.features import BLOCK, NAMES, Features, features
+from fluoro_shape_ros.method.fit.fit import fit
+from fluoro_shape_ros.sim.carm import CArm, biplane
+from fluoro_shape_ros.sim.scenes import xray_run
+from fluoro_shape_ros.sim.xray import Exposure
+
+SIZE = 512
+VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
+PX = 0.3e-3
+LITTLE = 0.1            # what a display's offset may change: the square root of counts no longer makes their noise quite even
+
+
+@cache
+def run(anatomy):
+    return xray_run(0, views=VIEWS, lengths=(0.06, 0.07), anatomy=anatomy)
+
+
+@cache
+def scene(anatomy):
+    return run(anatomy).scene()
+
+
+def fitted(images, views=VIEWS, anatomy=False, way=1):
+    """A pair's sheet, and the fit from the true curve."""
+    sheet = sheet_of(images, [field_of_view(i) for i in images], views, 'dark')
+    return sheet, fit(sheet, scene(anatomy).truth[::way], run(anatomy).radius)
+
+
+@cache
+def known(anatomy=False):
+    return fitted(scene(anatomy).frame.images, anatomy=anatomy)
+
+
+def named(f, sheet, tip_is_last=True):
+    return dict(zip(NAMES, features(f, sheet, run(False).radius, tip_is_last)))
+
+
+def assert_same(found, expected, atol, names=NAMES):
+    assert_allclose([found[n] for n in names], [expected[n] for n in names], atol=atol, err_msg=', '.join(names))
+
+
+def expected(anatomy=False):
+    sheet, f = known(anatomy)
+    return named(f, sheet)
+
+
+def test_there_is_a_finite_number_for_every_name():
+    assert NAMES == tuple(x.name for x in fields(Features))
+    for anatomy in (False, True):
+        assert len(expected(anatomy)) == len(NAMES) and np.isfinite(list(expected(anatomy).values())).all()
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+@pytest.mark.parametrize('planes', [(0,), (1,), (0, 1)])
+@pytest.mark.parametrize('change, atol', [(lambda i: 0.5 * i.astype(np.float32), 0.02), (lambda i: i.astype(np.uint16) * 200, 0.02),
+                                          (lambda i: 0.5 * i.astype(np.float32) + 40, LITTLE), (lambda i: i.astype(np.float32) + 40, LITTLE)],
+                         ids=['gain', '16 bit', 'gain and offset', 'offset'])
+def test_gain_and_offset_of_either_display_tell_nothing(anatomy, planes, change, atol):
+    images = [change(i) if k in planes else i for k, i in enumerate(scene(anatomy).frame.images)]
+    sheet, f = fitted(images, anatomy=anatomy)
+    assert_same(named(f, sheet), expected(anatomy), atol)
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+def test_exchanged_planes_say_the_same(anatomy):
+    sheet, f = fitted(scene(anatomy).frame.images[::-1], VIEWS[::-1], anatomy)
+    assert_same(named(f, sheet), expected(anatomy), 1e-3)
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+@pytest.mark.parametrize('plane, axis', [(0, 1), (1, 1), (1, 0)])
+def test_a_mirrored_plane_says_the_same(anatomy, plane, axis):
+    flip = np.eye(3)
+    flip[1 - axis, 1 - axis], flip[1 - axis, 2] = -1, SIZE - 1
+    images = [np.flip(i, axis).copy() if k == plane else i for k, i in enumerate(scene(anatomy).frame.images)]
+    views = [replace(v, P=flip @ v.P) if k == plane else v for k, v in enumerate(VIEWS)]
+    sheet, f = fitted(images, views, anatomy)
+    assert_same(named(f, sheet), expected(anatomy), 1e-3)
+
+
+def test_a_curve_that_runs_the_other_way_says_nearly_the_same():
+    sheet, f = fitted(scene(False).frame.images, way=-1)
+    assert_same(named(f, sheet, tip_is_last=False), expected(), LITTLE)       # its strips lie elsewhere by parts of a px
+
+
+def test_which_end_is_the_tip_exchanges_what_is_said_of_the_ends():
+    sheet, f = known(True)
+    f = replace(f, aside=np.array([[0.1, 0.2], [0.7, 0.3]]), open_end=np.array([False, False]))
+    one, other = named(f, sheet, True), named(f, sheet, False)
+    assert one['tip_aside'] == 0.7 and other['tip_aside'] == 0.2      # of both planes the darker
+    assert one['tip_stops'] != other['tip_stops']
+    assert_same(one, other, 0, [n for n in NAMES if not n.startswith('tip')])
+
+
+def test_a_quarter_of_the_dose_halves_the_signal_to_noise():
+    images = replace(run(False), exposure=Exposure(photons=Exposure().photons / 4)).scene().frame.images
+    sheet, f = fitted(images)
+    dim, clear = named(f, sheet), expected()
+    assert_allclose(clear['weakest'] - dim['weakest'], np.log(2), atol=0.25)        # the spread of some hundred places is known to a tenth
+    assert dim['residual'] > clear['residual'] and dim['sigma'] > clear['sigma'] and dim['tip_sigma'] > clear['tip_sigma']
+
+
+def aside(f, px, plane=0):
+    """The fit moved so that `plane` shows it so many px beside."""
+    chord, middle = np.diff(f.curve(2), axis=0)[0], f.curve(3)[1]
+    ray = np.linalg.inv(VIEWS[plane].P[:, :3]) @ np.append(project(VIEWS[plane].P, middle[None])[0], 1)
+    step = np.cross(chord, ray) / np.linalg.norm(np.cross(chord, ray))
+    return replace(f, spline=replace(f.spline, control=f.spline.control + px * PX * step))
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+@pytest.mark.parametrize('plane', [0, 1])
+@pytest.mark.parametrize('px', [-3, 3])
+def test_a_curve_beside_the_device_has_one_side_darker(anatomy, plane, px):
+    sheet, f = known(anatomy)
+    beside = named(aside(f, px, plane), sheet)
+    assert beside['symmetric'] > expected(anatomy)['symmetric'] + 0.5
+
+
+def test_along_an_edge_one_side_is_darker():
+    straight = np.c_[np.zeros((200, 2)), np.linspace(-0.03, 0.03, 200)]       # one column in both planes
+    columns = [float(project(v.P, straight)[100, 0]) for v in VIEWS]
+    images = [np.where(np.arange(SIZE) < c, 200, 120).astype(np.uint8)[None].repeat(SIZE, axis=0) for c in columns]
+    sheet, _ = known()
+    f = by_hand(straight)
+    edge, device = named(f, sheet_of(images, sheet.fields, VIEWS, 'dark')), expected()
+    assert edge['symmetric'] > 0.9 > 0.1 > device['symmetric']
+
+
+def by_hand(points):
+    """A fit that lies along (N, 3) points in m and comes from no image."""
+    _, f = known()
+    spline = through(points, 0.005)
+    s = np.arange(spline.start, spline.stop, PX)
+    return replace(f, spline=spline, start=0.0, stop=float(arc_length(points)[-1]), s=s, presence=np.ones((len(s), 2)), offset_px=np.zeros((len(s), 2)))
+
+
+def test_what_the_fit_left_over_is_its_rms_in_the_worse_plane():
+    sheet, f = known()
+    left = np.zeros_like(f.offset_px)
+    assert named(replace(f, offset_px=left), sheet)['residual'] == 0
+    assert_allclose(named(replace(f, offset_px=left + [0.4, -1.2]), sheet)['residual'], 1.2)
+    every_second = np.where(np.arange(len(f.s))[:, None] % 2, 1.0, np.nan)
+    assert_allclose(named(replace(f, offset_px=left + every_second), sheet)['residual'], 1.0)
+    assert named(replace(f, offset_px=left + np.nan), sheet)['residual'] == named(replace(f, offset_px=left + 9.0), sheet)['residual'] == 3.0
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+@pytest.mark.parametrize('share', [0.5, 0.9])
+def test_a_curve_that_is_cut_short_is_seen_to_go_on(anatomy, share):
+    sheet, f = known(anatomy)
+    whole, step = expected(anatomy), share * (f.stop - f.start)
+    no_tip, no_base = (named(replace(f, **cut), sheet) for cut in (dict(stop=f.start + step), dict(start=f.stop - step)))
+    assert whole['tip_stops'] > 0.6 > 0.25 > no_tip['tip_stops'] and no_base['tip_stops'] > 0.5      # what its base does says nothing
+    assert_allclose([no_tip['length'], no_base['length']], whole['length'] + np.log(share), atol=0.02)
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+def test_a_curve_that_is_too_long_is_not_shown_there(anatomy):
+    sheet, f = known(anatomy)
+    whole, longer = expected(anatomy), named(replace(f, stop=f.stop + 20 * (f.s[1] - f.s[0])), sheet)
+    assert longer['tip_shown'] < 0.3 < 0.7 < whole['tip_shown'] and longer['tip_stops'] < 0.3
+
+
+@pytest.mark.parametrize('plane', [0, 1])
+def test_what_one_plane_does_not_show_is_a_share_of_the_blocks(plane):
+    _, f = known()
+    there, gone = scene(False).frame.images, run(False).without_device().images
+    uv = project(VIEWS[plane].P, f.curve(3))[:, 0]
+    hidden = there[plane].copy()
+    far = slice(None, int(uv[1])) if uv[0] < uv[1] else slice(int(uv[1]) + 1, None)        # the base's half
+    hidden[:, far] = gone[plane][:, far]
+    sheet = sheet_of([hidden if k == plane else i for k, i in enumerate(there)], [field_of_view(i) for i in there], VIEWS, 'dark')
+    half, whole = named(f, sheet), expected()
+    assert_allclose(half['seen'], 0.5, atol=0.15)
+    assert half['weakest'] < whole['weakest'] - 1
+
+
+def test_where_it_leaves_the_field_an_end_says_nothing_against_it():
+    sheet, f = known()
+    f = replace(f, start=f.start + 0.01, stop=f.stop - 0.01, aside=np.zeros((2, 2)))
+    leaves = named(replace(f, open_end=np.array([False, True])), sheet)
+    assert leaves['tip_stops'] == leaves['tip_shown'] == 1
+    assert named(f, sheet)['tip_stops'] < 0.5
+
+
+def test_the_shape_by_hand():
+    """A length is in px of the finer plane, along an arc too."""
+    sheet, f = known()
+    angle = np.linspace(-0.6, 0.6, 300)
+    arc = 0.04 * np.c_[np.zeros(300), np.sin(angle), np.cos(angle) - 1]
+    turned, straight = named(by_hand(resample(arc, PX)[0]), sheet), named(by_hand(np.c_[np.zeros((200, 2)), np.linspace(-0.03, 0.03, 200)]), sheet)
+    assert_allclose([turned['length'], straight['length']], np.log([0.048 / PX, 0.06 / PX]), atol=0.02)
+    assert straight['length'] > np.log(2 * BLOCK)
+
+
+def test_what_is_handed_on():
+    sheet, f = known()
+    assert [named(replace(f, alone=np.array(a)), sheet)['hidden'] for a in ([-1, -1], [0, -1], [1, 0])] == [0, 1, 2]
+    twice = named(replace(f, end_sigma=2 * f.end_sigma, covariance=4 * f.covariance), sheet)
+    assert_allclose([twice[n] - expected()[n] for n in ('tip_sigma', 'sigma')], np.log(2))
+
+
+def test_the_same_fit_says_the_same_again():
+    sheet, f = known(True)
+    before = sheet.image.copy()
+    assert_array_equal(list(named(f, sheet).values()), list(named(f, sheet).values()))
+    assert_array_equal(sheet.image, before)
