@@ -3,14 +3,21 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from fluoro_shape_ros.bench import judge as bench_judge
+from fluoro_shape_ros.bench import main
+from fluoro_shape_ros.bench.families import Sources
 from fluoro_shape_ros.bench.judge import LEAST, Curves, calibrate, chosen_of, is_right, learn
+from fluoro_shape_ros.bench.trial import Answer
+from fluoro_shape_ros.data import Outcome
 from fluoro_shape_ros.method import judge
 from fluoro_shape_ros.method.features import MEAN, MEAN_PX, NAMES, TIP
 from fluoro_shape_ros.method.judge import FAR, LIMIT, NEAR, REASONS, SIGNS, judge_of, probability
+from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.resources import resource_path
 
 N = len(NAMES)
@@ -240,3 +247,35 @@ def test_right_is_as_near_as_the_confidence_promises():
     assert all(is_right(points, line, 1e-4) for points in (line, line + [0.9 * MEAN, 0, 0], until(0.7 * TIP)))
     assert not any(is_right(points, line, 1e-4) for points in (line[::-1], line + [1.1 * MEAN, 0, 0], until(1.3 * TIP)))
     assert is_right(line + [1.5 * MEAN, 0, 0], line, 2 * MEAN / MEAN_PX)        # a px at the device, where that is larger
+
+
+# ---- the command and the picture
+
+
+def test_the_command_says_where_there_is_too_little_to_learn_from(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(bench_judge, 'FAMILIES', {'p_xray': 1})
+    assert main.main(['judge', '--scenes', '1', '--first-seed', '7', '--jobs', '1', '--out', str(tmp_path / 'judge.json')]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert 'too few to learn from' in said and not (tmp_path / 'judge.json').exists()
+
+
+def test_tasks_are_shares_of_the_families_that_exist():
+    tasks = bench_judge.tasks(2, 100, Sources())
+    count = {name: sum(t.family == name for t in tasks) for name in bench_judge.FAMILIES}
+    assert count['ct'] == 0 and count['wide'] == 24 and count['clutter'] == 4 and count['p_xray'] == 1      # no CT is given
+    assert {t.seed for t in tasks if t.family == 'clutter'} == set(range(100, 104))
+
+
+def test_the_reliability_diagram_shows_silent_failures_in_their_colour(tmp_path):
+    pytest.importorskip('matplotlib')
+    from fluoro_shape_ros.bench.plot_confidence import draw
+
+    def red_pixels(tip):
+        answers = [Answer(k, Outcome.OK, errors=Errors(1e-4, 0.0, 0.0, tip, 0.0, 0.0), confidence=0.5 + k / 40) for k in range(20)]
+        draw([*answers, Answer(21, Outcome.LOW_CONFIDENCE)], tmp_path / 'confidence.png')
+        image = cv2.imread(str(tmp_path / 'confidence.png')).astype(int)
+        assert image.shape[1] == 1200 and image.std() > 5
+        near_top = image[:250, 650:]
+        return (np.abs(near_top - [0x5f, 0x5a, 0xff]).max(axis=2) < 3).sum()
+
+    assert red_pixels(5e-3) > red_pixels(1e-4) + 50       # all of them, or none
