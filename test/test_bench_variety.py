@@ -331,7 +331,7 @@ def test_only_the_first_pictures_of_a_family_are_kept():
 
 def test_command_prints_writes_and_draws(folder, tmp_path, capsys):
     file, out = tmp_path / 'v.json', tmp_path / 'sheets' / 'new'
-    assert main.main(['variety', '--families', 'open', '--open', str(folder), '--first-seed', '60', '--json', str(file), '--pictures', '1',
+    assert main.main(['variety', '--families', 'open', '--open', str(folder), '--first-seed', '60', '--min-confidence', '0.5', '--json', str(file), '--pictures', '1',
                       '--pictures-of', 'answered', '--sheets', str(out)]) == 0
     text = capsys.readouterr().out
     lines = [line.split() for line in text.splitlines()]
