@@ -31,6 +31,8 @@ class InputConfig:
     sync_slop: float = _p(0.010, 'Largest difference of the stamps of a pair', unit='s', low=0.0, high=1.0)
     mask_frames: int = _p(8, 'Device-free pairs averaged into the mask image by ~/capture_mask', low=1, high=256)
     threads: int = _p(2, 'Threads that OpenCV may use; 0: as many as there are cores', low=0, high=64)
+    time_budget: float = _p(0.2, 'How long the node may work on a pair before that is refused as out_of_time; 0: no limit. Offline tools and method:=paper have none',
+                            unit='s', low=0.0, high=60.0)
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,8 @@ def _checked(f: dataclasses.Field, value):
     """`value` in the type of field `f`, or ConfigError with name and reason."""
     m = f.metadata
     if m['element'] is not None:
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f'{f.name}: needs a list of numbers, got {value!r}')
         value = tuple(_number(f.name, v) for v in value)
         lengths, rule, reason = _LISTS[f.name]
         if len(value) not in lengths:

@@ -30,6 +30,7 @@ class Outcome(Enum):
     LENGTH = 'length_out_of_bounds'
     TIP_UNCERTAIN = 'tip_too_uncertain'
     LOW_CONFIDENCE = 'confidence_too_low'
+    OUT_OF_TIME = 'out_of_time'
 
 
 @dataclass(frozen=True)

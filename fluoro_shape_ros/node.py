@@ -16,16 +16,21 @@ from .tools import cli
 PROG = 'fluoro_shape_node'
 ROS_PACKAGES = ('rclpy', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_srvs', 'visualization_msgs')
 STOP_S = 1.0    # for the pair at work when the node is told to end
+SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 def main(argv=None) -> int:
     """Run the node; the exit code: 0 after SIGINT or SIGTERM, 1 without ROS (one line), 2 for unusable arguments (one line)."""
     # From rclpy.init on its own handlers end the spinning; Python's must not throw into whatever runs just then.
     told_to_stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in SIGNALS:
         signal.signal(number, lambda *_: told_to_stop.set())
     argv = sys.argv[1:] if argv is None else list(argv)
-    return cli.run(lambda _: _run(argv, told_to_stop), _parser(), own_arguments(argv))
+    try:
+        return cli.run(lambda _: _run(argv, told_to_stop), _parser(), own_arguments(argv))
+    finally:
+        for number in SIGNALS:      # Python gives them their defaults back while it is taken down, and a second one would end it by itself
+            signal.signal(number, signal.SIG_IGN)
 
 
 def own_arguments(argv: list[str]) -> list[str]:
@@ -60,6 +65,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     for package in ROS_PACKAGES:
         cli.need(package, 'ros')
     import rclpy
+    from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.qos_overriding_options import InvalidQosOverridesError
@@ -68,24 +74,26 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     from .transforms import TfMissing
     try:
         rclpy.init(args=argv)
-        node = FluoroShapeNode()
+        node, executor = FluoroShapeNode(), SingleThreadedExecutor()
     except rclpy_implementation.UnknownROSArgsError as error:
         return _refuse(f'unknown ROS arguments {error}')
     except (ConfigError, InvalidQosOverridesError) as error:
         rclpy.try_shutdown()
         return _refuse(error)
+    except ParameterException as error:     # of those that every node has, which rclpy checks; the name stands in its text twice
+        rclpy.try_shutdown()
+        return _refuse(str(error).rpartition(': ')[0])
     except TfMissing as error:
         rclpy.try_shutdown()
         raise cli.ToolError(error) from error
     except RuntimeError as error:   # rclpy has no type of its own for arguments that it can't parse
-        if 'context is invalid' in str(error):      # a signal has shut it down while the node was being made
+        if told_to_stop.is_set() or 'context is invalid' in str(error):     # a signal has shut it down while the node was being made
             return 0
         rclpy.try_shutdown()
         message = re.sub(r',? at \S+:\d+', '', str(error))     # without places in ROS's sources
-        if 'parse' not in message:
+        if not any(word in message for word in ('parse', 'QoS')):
             raise cli.ToolError(message) from error
         return _refuse(message)
-    executor = SingleThreadedExecutor()
     executor.add_node(node)
     gc.freeze()     # what the imports left stays anyway: to look through all of it now and then would hold up a pair for some 50 ms
     try:

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import array
 import dataclasses
+import difflib
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSReliabilityPolicy
 
-from .config import Config, constraint, fields
+from .config import Config, ConfigError, constraint, fields
 
 _TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE, str: Parameter.Type.STRING}
 _FIELDS = {f.name: f for f in fields()}
+_QOS = {'history': QoSHistoryPolicy, 'reliability': QoSReliabilityPolicy, 'durability': QoSDurabilityPolicy}
+MAX_DEPTH = 10000       # of a queue; the middleware makes room for some of it at once
 
 
 def declare(node: Node) -> Config:
     """Declare every parameter on `node` and return the Config of their values, overrides included.
 
-    Whole numbers are taken for real ones. Raises ConfigError for an override that can't work.
+    Whole numbers are taken for real ones. Raises ConfigError for an override that can't work, of a QoS policy too.
     """
+    _check_qos(node)
     # Statically typed declarations refuse `robot_radius:=1` and can't express an empty list, so: take what is
     # there, check and convert it, and only then fix type and range.
     given = {name: node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value for name in _FIELDS}
@@ -28,6 +33,36 @@ def declare(node: Node) -> Config:
         node.set_parameters([_parameter(_FIELDS[name], value)])
         node.set_descriptor(name, descriptor(_FIELDS[name]))
     return config
+
+
+def unknown(node: Node) -> str:
+    """The values given at the start to what is no parameter of `node`, each with the parameter that may be meant, in words; empty where there are none."""
+    known = list(node.get_parameters_by_prefix(''))
+    words = []
+    for name in _overrides(node):
+        if not node.has_parameter(name):
+            near = difflib.get_close_matches(name, known, 1)
+            words.append(f'there is no parameter {name}{f", but {near[0]}" if near else ""}')
+    return '; '.join(words)
+
+
+def _check_qos(node: Node) -> None:
+    """Raise ConfigError for a QoS override that rclpy would fail at without naming it."""
+    for name, value in _overrides(node).items():
+        first, policy = name.partition('.')[0], name.rpartition('.')[2]
+        if first != 'qos_overrides':
+            continue
+        if policy in _QOS:
+            choices = [c for c in _QOS[policy].short_keys() if c != 'unknown'] + ['auto'] * (policy == 'reliability' and '.subscription.' in name)
+            if value not in choices:
+                raise ConfigError(f'{name}: must be one of {", ".join(choices)}, got {value!r}')
+        elif policy == 'depth' and (type(value) is not int or not 0 <= value <= MAX_DEPTH):
+            raise ConfigError(f'{name}: needs a whole number from 0 to {MAX_DEPTH}, got {value!r}')
+
+
+def _overrides(node: Node) -> dict:
+    """Name to value of what was given at the start, declared or not; rclpy tells it nowhere else."""
+    return {name: p.value for name, p in node._parameter_overrides.items()}
 
 
 def descriptor(f: dataclasses.Field) -> ParameterDescriptor:

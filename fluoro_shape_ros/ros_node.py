@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import time
 import traceback
 from collections import deque
@@ -19,7 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.cameras import BadCameraInfo
-from msg_adapters.diagnostics import Tally, diagnostic_array, pairing_status, plane_status, reconstruction_status
+from msg_adapters.diagnostics import Tally, diagnostic_array, pairing_status, plane_status, reconstruction_status, trouble
 from msg_adapters.messages import ros_message, stamp_ns
 from msg_adapters.shapes import BadPath, path_to_points
 
@@ -38,6 +39,8 @@ from .worker import Job, Memory, Prediction, Worker, adapt, camera, checked_came
 
 PREDICTIONS = 256       # that are kept: a model may tell them faster than images come
 OVERDUE_S = 5.0         # a pair takes a fraction of a second; one that takes longer is told
+PERSISTENT_S = 2.5      # what keeps results from coming is worth a line in the log once it has lasted that long ...
+WARN_S = 30.0           # ... and another one after that
 
 
 class FluoroShapeNode(Node):
@@ -50,6 +53,7 @@ class FluoroShapeNode(Node):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
         self._enabled, self._overdue, self._levels, self._room = True, False, None, WaitingRoom()
+        self._trouble, self._namesakes, self._has_result = ('', 0.0), '', False     # which, since when
         self._predictions = deque(maxlen=PREDICTIONS)
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
@@ -71,6 +75,10 @@ class FluoroShapeNode(Node):
         self.add_on_set_parameters_callback(self._on_check_parameters)
         self.add_post_set_parameters_callback(self._on_parameters)
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))    # also while /clock stands still
+        unknown = params.unknown(self)
+        if unknown:
+            self.get_logger().warn(unknown)
+        self._introduce()
 
     def stop(self, timeout_s: float) -> bool:
         """End the worker; whether it got to the end of its pair in time."""
@@ -210,26 +218,32 @@ class FluoroShapeNode(Node):
 
     def _work(self, job: Job) -> None:
         """A pair from messages to messages, in the worker's thread."""
+        budget = job.config.input.time_budget
+        until = time.monotonic() + budget if budget else None
         if job.config.input.threads != self._threads:
             self._threads = job.config.input.threads
             cv2.setNumThreads(self._threads or -1)      # 0 would mean none for OpenCV
         adapted = adapt(job, self._view_of, self._lookup, self._tally)
-        frame, result = (None, adapted) if isinstance(adapted, Reconstruction) else (adapted, self._reconstruct(job, adapted))
+        frame, result = (None, adapted) if isinstance(adapted, Reconstruction) else (adapted, self._reconstruct(job, adapted, until))
         if result is not None:
             self._tally.result(result, time.monotonic() - job.arrived)
         self._answered.trigger()
         if result is not None:
             self._outputs.explain(job, frame, result)
 
-    def _reconstruct(self, job: Job, frame: Frame) -> Reconstruction | None:
+    def _reconstruct(self, job: Job, frame: Frame, until: float | None) -> Reconstruction | None:
         """The published answer to a frame; None where it went into the mask or was overtaken by a reset."""
         window = image_window(job, frame)
         if self._memory.take_for_mask(frame, window):
             return None
-        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window))
+        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window), until)
         if not self._memory.remember(job, frame, result):
             return None
         self._outputs.answer(frame, result)
+        if result.shape is not None and not self._has_result:
+            self._has_result = True
+            self.get_logger().info(f'first result, {1e3 * (time.monotonic() - job.arrived):.0f} ms after its images: {1e3 * result.shape.length:.1f} mm long, '
+                                   f'in frame "{frame.frame_id}"')
         return result
 
     def _failed(self, job: Job, error: Exception) -> None:
@@ -247,15 +261,20 @@ class FluoroShapeNode(Node):
         self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}'), latency_s)
         self._answered.trigger()
 
-    def _statuses(self) -> list:
+    def _summaries(self) -> tuple:
+        """Of the planes, of the pairing and of the reconstruction."""
         gap = self._pairer.gap_ns
         planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, **self._inputs.known(plane)) for plane in PLANES]
         pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)
         fault = self._tally.reason('prediction')
         still = 'use_sim_time is set, but there is no /clock' if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else ''
-        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still)))
+        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still, self._namesakes)))
         results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes,
                                              overdue_s=self._overdue_s())
+        return planes, pairing, results
+
+    def _statuses(self) -> list:
+        planes, pairing, results = self._summaries()
         return [*map(plane_status, planes), pairing_status(pairing), reconstruction_status(results)]
 
     def _overdue_s(self) -> float:
@@ -270,7 +289,7 @@ class FluoroShapeNode(Node):
 
     def _report(self, statuses) -> None:
         self._levels = _key(statuses)
-        self._diagnostics_out.publish(diagnostic_array(statuses, self.get_clock().now().nanoseconds, self.get_name(), ros_message))
+        self._diagnostics_out.publish(diagnostic_array(statuses, self.get_clock().now().nanoseconds, self.get_fully_qualified_name(), ros_message))
 
     def _report_changes(self) -> None:
         statuses = self._statuses()
@@ -281,7 +300,31 @@ class FluoroShapeNode(Node):
         gc.collect()    # cheap after node.main's freeze; Python keeps thousands of freed tuples for later, and only this gives them back
         self._inputs.count()
         self._hand_over()
+        self._warn()
         self._report(self._statuses())
+
+    def _introduce(self) -> None:
+        """The log's first line."""
+        given, named = self._config, self.resolve_topic_name
+        suffix = '/compressed' if given.input.image_transport == 'compressed' else ''
+        images, infos = (' and '.join(named(f'plane_{plane}/{topic}') + more for plane in PLANES) for topic, more in (('image_raw', suffix), ('camera_info', '')))
+        frame = f'frame "{given.input.reference_frame}"' if given.input.reference_frame else 'the frame of plane A\'s camera info'
+        self.get_logger().info(f'images on {images}, cameras on {infos} (geometry {given.input.geometry}); results on {named("backbone")} and '
+                               f'{named("tip")} in {frame}; method {given.curve.method}, robot_radius {1e3 * given.detection.robot_radius:g} mm')
+
+    def _warn(self) -> None:
+        """A line in the log now and then, while no results come or another node has the same name."""
+        me = self.get_name(), self.get_namespace()
+        count = self.get_node_names_and_namespaces().count(me)
+        self._namesakes = f'{count} nodes are named {self.get_fully_qualified_name()}: end all but one, or give them other names' if count > 1 else ''
+        if self._namesakes:
+            self.get_logger().warn(self._namesakes, throttle_duration_sec=WARN_S)
+        words, now = trouble(*self._summaries()), time.monotonic()
+        kind = re.sub(r'[\d.]+|, most often.*', '', words)
+        if kind != self._trouble[0]:
+            self._trouble = kind, now
+        if words and now > self._trouble[1] + PERSISTENT_S:
+            self.get_logger().warn(f'no results: {words}', throttle_duration_sec=WARN_S)
 
 
 def _key(statuses) -> list:

@@ -81,6 +81,8 @@ class ReconstructionSummary:
     rate_hz: float = 0.0            # of results
     latency_s: tuple[float, ...] = ()       # of the last results: second image's arrival to publication
     outcomes: dict[str, int] = field(default_factory=dict)
+    out_of_time: float = 0.0        # share of the pairs lately
+    refused: str = ''               # why most pairs were refused lately, in words; empty where any gave a result, or there was none
 
 
 def plane_status(s: PlaneSummary) -> Status:
@@ -153,10 +155,19 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
         level, message = WARN, '; '.join(notes)
     else:
         level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images' if ms else '')
+        message += f', {100 * s.out_of_time:.0f} % of the pairs out of time' if s.out_of_time else ''
     values = {'last outcome': last, 'last detail': s.detail, 'confidence': probability(s.confidence), 'warnings': ', '.join(s.warnings),
-              'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction, 'overdue pairs': s.overdue,
+              'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction, 'overdue pairs': s.overdue, 'out of time (%)': f'{100 * s.out_of_time:.0f}',
               'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
     return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
+
+
+def trouble(planes: list[PlaneSummary], pairing: PairingSummary, results: ReconstructionSummary) -> str:
+    """What keeps results from coming, in words; empty where they come, or are not to come."""
+    if not results.enabled or results.capturing or results.rate_hz:
+        return ''
+    missing, pairs = [s for s in map(plane_status, planes) if s.level in (STALE, ERROR)], pairing_status(pairing)
+    return '; '.join(f'{s.name}: {s.message}' for s in missing) or results.refused or (pairs.message if pairs.level in (WARN, ERROR) else '')
 
 
 def probability(value: float) -> str:
@@ -208,6 +219,8 @@ class Tally:
         self.event(f'outcome {result.outcome.value}', latency_s)
         self.event('answer')
         self._result = result
+        with self._lock:
+            self._reasons[f'outcome {result.outcome.value}'] = result.detail
 
     def reason(self, name: str) -> str:
         """Why the last one of `name` was refused; empty where it was not."""
@@ -247,9 +260,19 @@ class Tally:
         with self._lock:
             latency = tuple(value for _, value in self._recent(good, self._clock()))
             outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
+            lately = {name: len(self._recent(f'outcome {name}', self._clock())) for name in outcomes}
         seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, confidence=done.confidence, prediction=done.prediction)
         return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes,
-                                     overdue=self.count('overdue'), **seen, **known)
+                                     overdue=self.count('overdue'), out_of_time=lately.get(Outcome.OUT_OF_TIME.value, 0) / max(sum(lately.values()), 1),
+                                     refused=self._refused(lately), **seen, **known)
+
+    def _refused(self, lately: dict[str, int]) -> str:
+        """Why most pairs were refused, of the number of each outcome."""
+        if not any(lately.values()) or lately.get(Outcome.OK.value):
+            return ''
+        usual = max(lately, key=lately.get)
+        reason = ': '.join(filter(None, (usual, self.reason(f'outcome {usual}'))))
+        return f'none of the last {sum(lately.values())} pairs gave a result, most often for {reason}'
 
     def _recent(self, name: str, now: float) -> deque:
         events = self._events.setdefault(name, deque(maxlen=1000))

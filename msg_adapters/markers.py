@@ -1,7 +1,7 @@
 """The backbone for the eye: a visualization_msgs/MarkerArray for RViz and Foxglove.
 
 Everything is in the reference frame, in metres; `new` is a factory (see messages). Every array sets or deletes all of NAMES, so that
-nothing of an earlier pair stays in view.
+nothing of an earlier pair stays in view, and what it sets vanishes by itself after LIFETIME_S, so that nothing stays when the stream ends.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from .shapes import _worst_sigma, orientations, tangents
 
 NAMES = ('tube', 'tip', 'tip uncertainty', 'outcome')   # namespaces, one marker each
 CONFIDENCE = 0.95       # of the tip's ellipsoid
+LIFETIME_S = 3
 RINGS, SIDES = 40, 8    # of the tube's mesh, at most
 TEXT_HEIGHT = 0.004     # m
 TEXT_GAP = 0.01         # m, beyond the tip
@@ -46,9 +47,9 @@ def rejection_to_markers(text: str, place, stamp_ns: int, frame_id: str, new: Ne
 
 
 def _array(markers: list[dict | None], stamp_ns: int, frame_id: str, new: New):
-    head = header(new, stamp_ns, frame_id)
+    head, lifetime = header(new, stamp_ns, frame_id), new('builtin_interfaces/msg/Duration', sec=LIFETIME_S)
     return new('visualization_msgs/msg/MarkerArray', markers=[
-        new('visualization_msgs/msg/Marker', header=head, ns=name, action=_DELETE if fields is None else _ADD, **(fields or {}))
+        new('visualization_msgs/msg/Marker', header=head, ns=name, action=_DELETE if fields is None else _ADD, lifetime=lifetime, **(fields or {}))
         for name, fields in zip(NAMES, markers, strict=True)])
 
 

@@ -250,8 +250,11 @@ class Client:
 
 @contextmanager
 def answered(tmp_path_factory, *parameters):
-    """A NodeProcess and a Client that it has answered; when the block is left, the node must be alive and have told of no bug."""
-    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', *parameters) as node, Client() as client:
+    """A NodeProcess and a Client that it has answered; when the block is left, the node must be alive and have told of no bug.
+
+    It takes its time: on a busy machine some pair would be out of time.
+    """
+    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', 'time_budget:=0', *parameters) as node, Client() as client:
         assert client.connected() and client.insist(lambda: client.paths), node.log
         yield node, client
         assert node.process.poll() is None, node.log

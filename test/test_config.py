@@ -28,6 +28,7 @@ def test_replace_keeps_the_rest():
     ('robot_radius', -1.0, 'must lie in'), ('robot_radius', float('nan'), 'finite'), ('robot_radius', 'thin', 'number'), ('robot_radius', True, 'number'),
     ('polarity', 'grey', 'must be one of dark, bright, auto'), ('min_confidence', 1.01, 'must lie in'), ('rectified', 1, 'needs a bool'), ('mask_frames', 0, 'must lie in'),
     ('mask_frames', 2.5, 'needs a int'), ('base_position', [1.0, 2.0], 'needs 0 or 3 numbers'), ('expected_length', [0.2, 0.1], 'min < max'),
+    ('base_position', 5, 'needs a list of numbers, got 5'), ('expected_length', 'long', 'needs a list of numbers'), ('time_budget', -0.1, 'must lie in'),
     ('expected_length', [0.1, float('inf')], 'finite')])
 def test_what_cannot_work_is_refused(name, value, reason):
     with pytest.raises(ConfigError, match=f'{name}.*{reason}'):

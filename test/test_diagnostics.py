@@ -7,7 +7,7 @@ import pytest
 from fluoro_shape_ros.data import Outcome, Reconstruction
 from fluoro_shape_ros.pairing import Counts
 from msg_adapters.diagnostics import (ERROR, OK, STALE, WARN, WINDOW_S, PairingSummary, PlaneSummary, ReconstructionSummary, Status, Tally,
-                                      diagnostic_array, pairing_status, plane_status, reconstruction_status)
+                                      diagnostic_array, pairing_status, plane_status, reconstruction_status, trouble)
 
 
 class Clock:
@@ -67,6 +67,8 @@ def test_pairing(summary, level, words):
     (ReconstructionSummary(capturing=True, mask='capturing, 3 of 8 pairs'), OK, '3 of 8'),
     (ReconstructionSummary(outcome=Outcome.OK, detail='ok', silent_s=0.1, rate_hz=4.0), OK, '4.0 results/s'),
     (ReconstructionSummary(outcome=Outcome.OK, silent_s=0.1, rate_hz=4.0, latency_s=(0.03, 0.04, 0.2)), OK, '4.0 results/s, 40 ms after'),
+    (ReconstructionSummary(outcome=Outcome.OK, silent_s=0.1, rate_hz=4.0, latency_s=(0.04,), out_of_time=0.2), OK, 'images, 20 % of the pairs out of time'),
+    (ReconstructionSummary(outcome=Outcome.OUT_OF_TIME, detail='no curve', silent_s=0.1), WARN, 'out_of_time: no curve'),
     (ReconstructionSummary(outcome=Outcome.OK, silent_s=0.1, warnings=('tip_ambiguous',)), WARN, 'tip_ambiguous'),
     (ReconstructionSummary(outcome=Outcome.OK, silent_s=0.1, notes=('mask cleared',)), WARN, 'mask cleared'),
     (ReconstructionSummary(outcome=Outcome.NO_DEVICE_A, detail='no curve', silent_s=0.1), WARN, 'no_device_in_plane_a: no curve'),
@@ -133,6 +135,46 @@ def test_outcomes_are_counted_and_the_last_one_told(tally, clock):
     assert summary.outcomes == {'no_device_in_plane_a': 3, 'curvature_too_high': 1}
     assert (summary.outcome, summary.detail, summary.warnings, summary.silent_s) == (Outcome.CURVATURE, 'too bent', (), 0.5)
     assert summary.rate_hz == 0 and summary.latency_s == ()     # of results, and there was none
+
+
+def test_the_share_of_the_pairs_that_are_out_of_time_is_told(tally, clock):
+    share = lambda: reconstruction_status(tally.reconstruction()).values['out of time (%)']     # noqa: E731
+    assert share() == '0'
+    for outcome in (Outcome.OUT_OF_TIME, Outcome.NO_DEVICE_A, Outcome.OUT_OF_TIME, Outcome.LENGTH):
+        tally.result(Reconstruction(outcome), 0.2)
+    assert share() == '50' and tally.reconstruction().outcomes['out_of_time'] == 2
+    clock.now += WINDOW_S + 1
+    tally.result(Reconstruction(Outcome.LENGTH), 0.2)
+    assert share() == '0' and tally.reconstruction().outcomes['out_of_time'] == 2
+
+
+def test_the_commonest_reason_is_told_where_everything_is_refused(tally, clock):
+    assert tally.reconstruction().refused == ''
+    for outcome, detail in ((Outcome.LENGTH, 'too long'), (Outcome.NO_DEVICE_A, 'no line'), (Outcome.NO_DEVICE_A, 'no line'), (Outcome.CURVATURE, '')):
+        tally.result(Reconstruction(outcome, detail), 0.02)
+    assert tally.reconstruction().refused == 'none of the last 4 pairs gave a result, most often for no_device_in_plane_a: no line'
+    tally.event(f'outcome {Outcome.OK.value}')
+    assert tally.reconstruction().refused == ''
+    clock.now += WINDOW_S + 1
+    assert tally.reconstruction().refused == ''
+
+
+ALIVE, PAIRS = dict(silent_s=0.1, has_camera=True, rate_hz=15.0), PairingSummary(Counts(), 0.01, silent_s=0.1, rate_hz=15.0)
+UNPAIRED = PairingSummary(Counts(), 0.01, both_alive=True, gap_s=-0.03)
+
+
+@pytest.mark.parametrize('a, pairing, results, words', [
+    ({}, UNPAIRED, {}, 'plane a: no image yet'),
+    (dict(silent_s=0.1), PAIRS, dict(refused='none'), 'plane a: no camera info yet'),
+    (ALIVE, PAIRS, dict(refused='none of the last 3 pairs'), 'none of the last 3 pairs'),
+    (ALIVE, UNPAIRED, {}, 'nothing pairs: the newest stamps differ by 30.0 ms, sync_slop is 10.0 ms'),
+    (ALIVE, PairingSummary(Counts(), 0.01), {}, ''),        # a moment after the streams began
+    (ALIVE, PAIRS, dict(outcome=Outcome.OK, rate_hz=7.0, warnings=('tip_ambiguous',), silent_s=0.1), ''),
+    ({}, UNPAIRED, dict(enabled=False), ''),
+    (ALIVE, PAIRS, dict(capturing=True, refused='none'), ''),
+])
+def test_what_keeps_results_from_coming(a, pairing, results, words):
+    assert trouble([PlaneSummary('a', **a), PlaneSummary('b', **ALIVE)], pairing, ReconstructionSummary(**results)) == words
 
 
 def test_pairing_summary_sees_both_streams(tally):

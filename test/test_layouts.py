@@ -42,6 +42,6 @@ def test_foxglove_shows_backbone_tip_markers_both_overlays_and_diagnostics():
     assert sorted(leaves(layout['layout'])) == sorted(panels)
     assert {name.split('!')[0] for name in panels} == FOXGLOVE_PANELS
     named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(panels)))
-    assert named == set(TOPICS)
+    assert named == {*TOPICS, '/fluoro_shape'}     # the node's name stands before those of its statuses
     assert [panels[f'Image!plane_{p}']['imageMode']['imageTopic'] for p in 'ab'] == ['/plane_a/overlay', '/plane_b/overlay']
     assert all(panels['3D!backbone']['topics'][topic]['visible'] for topic in ('/markers', '/backbone', '/tip_pose'))

@@ -144,6 +144,7 @@ def test_pause_and_resume(client):
     ('polarity', 'grey', 'polarity: must be one of dark, bright, auto'),
     ('expected_length', [0.2, 0.1], 'needs 0 <= min < max'),
     ('base_position', [0.0], 'base_position: needs 0 or 3 numbers'),
+    ('time_budget', -0.1, 'time_budget'),
 ])
 def test_a_value_that_cannot_work_is_refused_and_the_old_one_stays(client, name, value, reason):
     get = lambda: client.call(GetParameters, '/fluoro_shape/get_parameters', GetParameters.Request(names=[name])).values   # noqa: E731
@@ -163,6 +164,15 @@ def test_parameters_take_effect_at_run_time(client):
     assert path.header.frame_id == 'plane_a_optical'
     assert np.allclose(np.linalg.norm(np.diff(points(path), axis=0), axis=1)[:-1], 0.005, atol=1e-4)
     assert client.set('backbone_spacing', 0.001).successful and client.set('reference_frame', 'cell').successful
+
+
+def test_what_is_not_found_in_time_is_named_and_counted(client):
+    assert client.set('time_budget', 1e-6).successful and client.trigger('reset').success       # so that there is nothing to track
+    stamp = client.send_pixels(GOOD)
+    assert client.hears('out_of_time: no curve was found by then') and stamp not in client.paths
+    assert int(client.value('reconstruction', 'count out_of_time')) >= 1 and 0 < int(client.value('reconstruction', 'out of time (%)')) <= 100
+    assert client.set('time_budget', 0).successful      # no limit
+    assert client.answer(client.send_pixels(GOOD))
 
 
 def test_reliability_can_be_chosen(client):

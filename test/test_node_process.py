@@ -49,6 +49,47 @@ def test_a_signal_in_the_middle_of_a_pair(log, number):
         assert node.end(number) == 0 and 'Traceback' not in node.log
 
 
+@pytest.mark.parametrize('first, second', [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGTERM)])
+def test_more_signals_while_it_ends_change_nothing(log, first, second):
+    with NodeProcess(log, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+        assert client.until(lambda: 'images on' in node.log)
+        node.process.send_signal(first)
+        while node.process.poll() is None:
+            node.process.send_signal(second)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                node.process.wait(timeout=0.003)
+        assert node.process.returncode == 0 and 'Traceback' not in node.log, node.log
+
+
+def test_the_log_tells_what_it_listens_to_what_is_missing_and_the_first_result(log):
+    code = """if True:
+        import sys
+        from fluoro_shape_ros import ros_node
+        from fluoro_shape_ros.node import main
+        ros_node.WARN_S = 1.0
+        sys.exit(main())"""
+    given = 'reference_frame:=cell', 'robot_radus:=0.001', 'time_budget:=0', BASE, ros.RADIUS
+    with NodeProcess(log, *given, code=code, arguments=('-r', 'plane_b/image_raw:=/lateral'), domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+        assert client.until(lambda: 'no results: plane a: no image yet' in node.log)
+        first, second = node.log.splitlines()[:2]
+        assert first.startswith('[WARN]') and first.endswith('there is no parameter robot_radus, but robot_radius')
+        assert second.startswith('[INFO]') and all(words in second for words in (
+            '/plane_a/image_raw and /lateral', '/plane_a/camera_info and /plane_b/camera_info', '/backbone', 'frame "cell"', 'method spline', 'robot_radius 1 mm'))
+        client.node.destroy_publisher(client.images[1])
+        client.images[1] = client.node.create_publisher(ros.Image, '/lateral', 10)
+        assert client.connected() and client.insist(lambda: client.paths, every=1.0) and client.good()
+        blank = lambda: 'pairs gave a result, most often for no_device_in_plane_a: no line of at least' in node.log     # noqa: E731
+        assert client.insist(blank, pair=ros.BLANK)
+        assert node.end() == 0 and node.log.count('[INFO]') == 2 and node.log.count('first result') == 1
+
+
+def test_two_nodes_of_one_name_are_told(log, tmp_path):
+    with NodeProcess(log, domain=ros.OTHER) as node, NodeProcess(tmp_path / 'other.txt', domain=ros.OTHER) as other, Client(domain=ros.OTHER) as client:
+        words = 'nodes are named /fluoro_shape: end all but one'
+        assert client.until(lambda: words in node.log and words in other.log)
+        assert client.hears(words) and (node.end(), other.end()) == (0, 0)
+
+
 def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
     code = """if True:
         import sys
@@ -90,7 +131,7 @@ def test_poses_of_moving_planes_come_from_tf(log):
                 return Fields(transform=Fields(rotation=vector('xyzw', Rotation.from_matrix(R).as_quat()), translation=vector('xyz', t)))
         sys.modules['tf2_ros'] = Fields(Buffer=Buffer, TransformListener=lambda buffer, node: node, TransformException=LookupError)
         sys.exit(main())"""
-    parameters = ('geometry:=tf', 'reference_frame:=cell', BASE, ros.RADIUS)
+    parameters = ('geometry:=tf', 'reference_frame:=cell', 'time_budget:=0', BASE, ros.RADIUS)
     with NodeProcess(log, *parameters, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         infos = [ros.info_msg(np.c_[ros.intrinsics(), np.zeros(3)]) for _ in 'ab']
         heard = lambda: any('no_device' in s.message for s in client.statuses)      # noqa: E731
@@ -121,6 +162,8 @@ def test_parameter_files_that_are_installed(tmp_path):
             taken = client.get(*values, node=f'/{name}/fluoro_shape')
             assert [list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)] == list(values.values()), name
         assert client.hears('no image yet: nobody publishes /defaults/plane_a/image_raw and /defaults/plane_a/camera_info')
+        assert client.until(lambda: {s.hardware_id for s in client.statuses} == {f'/{name}/fluoro_shape' for name in given})
+        assert all(s.name.startswith(f'{s.hardware_id}: ') for s in client.statuses)
 
 
 def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log):
@@ -164,6 +207,10 @@ def test_help():
     (['--speed', '3'], '--speed'),
     (['--ros-args', '-p', 'robot_radius:=-1.0'], 'robot_radius: must lie in'),
     (['--ros-args', '-p', 'polarity'], 'polarity'),
+    (['--ros-args', '-p', 'base_position:=5'], 'base_position: needs a list of numbers, got 5'),
+    (['--ros-args', '-p', 'use_sim_time:=1'], "'use_sim_time' to '1' of type 'INTEGER', expecting type 'BOOL'"),
+    (['--ros-args', '-p', 'tracking:="true"'], "tracking: needs a bool, got 'true'"),
+    (['--ros-args', '-p', 'qos_overrides./tip.publisher.depth:=many'], 'qos_overrides./tip.publisher.depth: needs a whole number'),
     (['--ros-args', '--wings'], '--wings'),
 ])
 def test_unusable_arguments(arguments, words):

@@ -70,11 +70,36 @@ def test_overrides_are_taken(make, name, given, taken):
     ('polarity', 'grey', 'polarity: must be one of dark, bright, auto'),
     ('threads', 2.0, 'threads: needs a int'),
     ('tracking', 1, 'tracking: needs a bool'),
+    ('tracking', 'true', 'tracking: needs a bool'),     # as a quoted one comes
+    ('base_position', 5, 'base_position: needs a list of numbers, got 5'),
+    ('time_budget', -1.0, 'time_budget: must lie in [0, 60] s'),
+    ('qos_overrides./backbone.publisher.depth', 'abc', 'depth: needs a whole number from 0'),
+    ('qos_overrides./backbone.publisher.depth', -3, 'depth: needs a whole number from 0'),
+    ('qos_overrides./plane_a/image_raw.subscription.depth', True, 'depth: needs a whole number from 0'),
+    ('qos_overrides./backbone.publisher.reliability', 5, 'reliability: must be one of'),
+    ('qos_overrides./backbone.publisher.reliability', 'auto', 'reliability: must be one of'),
+    ('qos_overrides./backbone.publisher.history', [1, 2], 'history: must be one of'),
+    ('qos_overrides./plane_a/camera_info.subscription.durability', 'maybe', 'durability: must be one of system_default, transient_local, volatile'),
 ])
 def test_unusable_overrides_are_refused_by_name(make, name, given, reason):
     with pytest.raises(ConfigError) as error:
         params.declare(make(**{name: given}))
     assert reason in str(error.value)
+
+
+def test_qos_overrides_that_can_work_are_let_through(make):
+    given = {'backbone.publisher.depth': 3, 'plane_a/image_raw.subscription.reliability': 'auto', 'tip.publisher.reliability': 'best_effort',
+             'plane_a/image_raw.subscription.history': 'keep_all', 'backbone.publisher.deadline': 'some time'}
+    assert params.declare(make(**{f'qos_overrides./{name}': value for name, value in given.items()})) == Config()
+
+
+def test_a_name_that_is_unknown_is_told_with_the_nearest_that_is_known(make):
+    node = make(robot_radus=0.001, polarity='bright', use_sim_time=False, zzz=1)
+    params.declare(node)
+    assert params.unknown(node) == 'there is no parameter robot_radus, but robot_radius; there is no parameter zzz'
+    node = make(robot_radius=0.001)
+    params.declare(node)
+    assert params.unknown(node) == ''
 
 
 def test_descriptors_say_what_the_config_knows(make):

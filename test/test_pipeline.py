@@ -347,6 +347,39 @@ def test_a_robot_radius_that_is_far_off_is_borne_or_named(seed, contrast, wider)
         assert result.outcome is Outcome.LOW_CONFIDENCE and result.detail
 
 
+PAST, NEVER = 0.0, 1e12     # time.monotonic(): time is up from the beginning, or never
+
+
+def test_a_search_that_is_cut_short_is_out_of_time(scene, config):
+    result = reconstruct(scene.frame, config, until=PAST)
+    assert result.outcome is Outcome.OUT_OF_TIME and result.detail == 'no curve was found by then' and result.shape is None
+
+
+def test_what_was_found_by_then_is_judged(scene, config, answer):
+    prior = Prior(previous=answer.shape)
+    result = reconstruct(scene.frame, config.replace(min_confidence=1.0), prior, PAST)
+    assert result.outcome is Outcome.OUT_OF_TIME and 'by then: ' in result.detail and 0.5 < result.confidence < 1 and None not in result.centerlines
+    assert_same(reconstruct(scene.frame, config.replace(min_confidence=0.5), prior, PAST), answer)
+    assert reconstruct(scene.frame, config.replace(expected_length=(0.1, 0.2)), prior, PAST).outcome is Outcome.LENGTH      # no more time would have helped
+
+
+def test_the_device_is_looked_for_where_it_was_however_late_it_is(scene, config, answer):
+    prior = Prior(previous=answer.shape)
+    given = reconstruct(scene.frame, config, prior, PAST)
+    assert given.outcome is Outcome.OK and (given.shape.points == reconstruct(scene.frame, config, prior).shape.points).all()
+
+
+def test_a_search_that_ends_in_time_is_as_without_a_limit(scene, blank, config, answer):
+    given = reconstruct(scene.frame, config, until=NEVER)
+    assert (given.shape.points == answer.shape.points).all() and given.confidence == answer.confidence
+    assert reconstruct(blank, config, until=NEVER).outcome is Outcome.NO_DEVICE_A
+
+
+def test_the_published_method_has_no_limit(scene, config):
+    given = config.replace(method='paper')
+    assert reconstruct(scene.frame, given, until=PAST).outcome is reconstruct(scene.frame, given).outcome is not Outcome.OUT_OF_TIME
+
+
 def test_limits_that_are_kept_reject_nothing(scene, config, answer):
     kept = config.replace(max_tip_sigma=0.001, expected_length=(0.05, 0.08), max_curvature=60.0, min_length_px=150.0, max_reprojection_px=0.5)
     assert_same(reconstruct(scene.frame, kept), answer)

@@ -197,6 +197,55 @@ def test_a_lead_in_doubt_competes_with_what_is_found(chosen, sheet):
     assert best.fit is not part and p < judge.probability(best.log_odds)
 
 
+def late_from(ask):
+    """A clock that says that time is up when it is asked for the `ask`-th time, and from then on; and the list of its answers."""
+    asked = []
+    return lambda: asked.append(len(asked) + 1 >= ask) or asked[-1], asked
+
+
+@pytest.mark.parametrize('ask, fits, looked', [(1, 0, []), (2, 0, [False]), (3, 1, [False]), (4, 2, [False]), (5, 2, [False, True]), (6, 3, [False, True])])
+def test_when_time_is_up_nothing_else_is_begun(scene, sheet, monkeypatch, ask, fits, looked):
+    """Asked before the plain lines, before the fit of each, before the faint lines, before the fit of each, and before all else."""
+    plain, faint = ([Hypothesis(scene.truth, lines(scene.truth)) for _ in range(n)] for n in (2, 1))
+    fitted, asked = counted(monkeypatch, plain, faint)
+    late, said = late_from(ask)
+    tried, _ = searched(sheet, settles=never, late=late, judge=lambda _: (np.zeros(0), search.HOPELESS - 1, True))     # none is fitted twice
+    assert (len(fitted), asked) == (fits, looked) and len(tried) == fits and said.index(True) == ask - 1
+
+
+def test_nothing_is_late_where_nothing_is_left(chosen, sheet, monkeypatch):
+    late, said = late_from(1)
+    counted(monkeypatch, [])
+    assert len(searched(sheet, leads=[chosen.fit], settles=always, late=late)[0]) == 1 and not said
+
+
+def test_a_fit_that_still_moves_when_time_is_up_is_left_there(chosen, scene, sheet, monkeypatch):
+    counted(monkeypatch, [Hypothesis(scene.truth, lines(scene.truth))])
+    monkeypatch.setattr(search, 'fit', lambda *_, **__: replace(chosen.fit, moved_px=1.1 * RESTLESS_PX))
+    for ask, count in ((3, 1), (4, 2)):
+        assert len(searched(sheet, settles=never, late=late_from(ask)[0])[0]) == count
+
+
+def test_what_settles_it_is_compared_with_the_other_way_round_however_late_it_is(scene, sheet, monkeypatch):
+    same = lines(scene.truth)
+    fitted, _ = counted(monkeypatch, [Hypothesis(scene.truth, same), Hypothesis(scene.truth[::-1], same)])
+    tried, _ = searched(sheet, settles=always, late=late_from(3)[0])
+    assert len(tried) == len(fitted) == 2
+
+
+def test_lines_of_one_plane_are_not_looked_for_in_the_other_when_time_is_up(scene, sheet, monkeypatch):
+    swept = []
+    monkeypatch.setattr(search, 'candidates', lambda *_: tuple([c] for c in lines(scene.truth)))
+    monkeypatch.setattr(search, 'by_lines', lambda *_: iter(()))
+    monkeypatch.setattr(search, 'sweep', lambda *_: swept.append(1))
+    guess = look(Prior(predicted=scene.truth + [0.03, 0.03, 0]), VIEWS, 0.01)[0]
+    monkeypatch.setattr(search, 'follow', lambda *_, **__: None)
+    for ask, count in ((4, 0), (5, 1), (9, 2)):
+        del swept[:]
+        searched(sheet, guess, settles=never, late=late_from(ask)[0])
+        assert len(swept) == count
+
+
 def test_what_is_shorter_than_asked_for_is_not_tried(chosen, sheet, monkeypatch):
     short = replace(chosen.fit, stop=chosen.fit.start + 0.9 * MIN_LENGTH * (chosen.fit.s[1] - chosen.fit.s[0]))
     counted(monkeypatch, [])

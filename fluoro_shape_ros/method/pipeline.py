@@ -29,11 +29,15 @@ from .search import Attempt, choose, projected, tries
 from .tip import tip_of
 
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
+OPEN = {Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B, Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE}     # what a longer search might have answered
 
 
-def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconstruction:
-    """The backbone seen in a pair of images, or the reason why there is none. Pure: the same pair gives the same answer."""
-    clock = _Stopwatch()
+def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: float | None = None) -> Reconstruction:
+    """The backbone seen in a pair of images, or the reason why there is none. Pure: the same pair gives the same answer.
+
+    until: time.monotonic() from which on no other hypothesis is tried, and what was found by then is judged; None: no limit, and the same answer on any machine.
+    """
+    clock = _Stopwatch(until)
     try:
         check(frame.views, config.detection.robot_radius)
     except GeometryError as error:
@@ -43,7 +47,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior()) -> Reconst
     clock.lap('prepare')
     by = _by_paper if config.curve.method == 'paper' else _by_spline
     guess, why = look(prior, frame.views, config.curve.prior_sigma)
-    return judged(by(frame, images, fields, config, prior, guess, clock), guess, why)
+    return judged(_in_time(by(frame, images, fields, config, prior, guess, clock), clock), guess, why)
 
 
 def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
@@ -69,7 +73,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     if chosen is None:
         sheet = sheet_of(images, fields, frame.views, polarity)
         tried, lines = tries(sheet, radius, config.detection.min_length_px, partial(sized_up, sheet), lambda odds: model.settles(odds, enough),
-                             guess, leads)
+                             guess, leads, clock.late)
         clock.lap('search')
         if not tried:
             return _nothing(lines, config, clock)
@@ -98,11 +102,19 @@ def _near(frame: Frame, images, fields, config: Config, prior: Prior, guess: Gue
         clock.lap('track')
         if found is not None:
             yield found
-    if guess is not None:
+    if guess is not None and not clock.late():
         found = predicted(*here, guess)
         clock.lap('follow')
         if found is not None:
             yield found
+
+
+def _in_time(result: Reconstruction, clock: _Stopwatch) -> Reconstruction:
+    """The same, or out of time where the clock cut the search short and it might have gone otherwise."""
+    if not clock.cut_short or result.outcome not in OPEN:
+        return result
+    found = f'the likeliest curve by then: {result.detail}' if result.outcome is Outcome.LOW_CONFIDENCE else 'no curve was found by then'
+    return replace(result, outcome=Outcome.OUT_OF_TIME, detail=found)
 
 
 def _nothing(lines, config: Config, clock: _Stopwatch) -> Reconstruction:
@@ -201,11 +213,17 @@ def _known_order(points: np.ndarray, prior: Prior, guess: Guess | None) -> np.nd
 
 
 class _Stopwatch:
-    """Wall time of each stage, s."""
+    """Wall time of each stage, s, and whether something was left undone because time was up."""
 
-    def __init__(self):
+    def __init__(self, until: float | None):
         self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
+        self.cut_short = False
+        self._until, self._last = until, time.perf_counter()
+
+    def late(self) -> bool:
+        """Whether time is up; who asks leaves undone what is left."""
+        self.cut_short = self._until is not None and time.monotonic() >= self._until
+        return self.cut_short
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()

@@ -45,11 +45,12 @@ class Attempt:
 
 
 def tries(sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fit], tuple[np.ndarray, float, bool]], settles: Callable[[float], bool],
-          guess: Guess | None = None, leads: Sequence[Fit] = ()) -> tuple[list[Attempt], tuple]:
+          guess: Guess | None = None, leads: Sequence[Fit] = (), late: Callable[[], bool] = lambda: False) -> tuple[list[Attempt], tuple]:
     """All that was tried, and the line of each plane that stands out most, None where none does.
 
     judge: features and log odds of a fit, and whether its last end is the tip.
     settles: whether a fit with these log odds needs no other beside it. leads: fits that stand already.
+    late: whether time is up, which once true stays so; asked before each step that takes long, and only where there is one left.
     """
     views, tried, seen = sheet.views, [], (None, None)
 
@@ -57,13 +58,15 @@ def tries(sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fi
         return bool(tried) and settles(max(t.log_odds for t in tried))
 
     def go(hypotheses: Iterator[Hypothesis]) -> None:
-        """Fit each; once one is beyond doubt, only the same lines read the other way round."""
+        """Fit each; once one is beyond doubt, only the same lines read the other way round, and these however late it is."""
         last = None
         for h in hypotheses:
             if settled() and not (last is not None and any(h.lines) and h.lines == last):
                 break
             last = h.lines
             for _ in range(2):
+                if not settled() and late():
+                    return
                 fitted = fit(sheet, h.curve, radius, h.coarse, clearing=h.clearing)
                 if fitted is None or not (any(h.lines) or guess is None or borne_out(fitted.curve(100), guess)) or not _long_enough(fitted, min_length_px):
                     break
@@ -74,18 +77,18 @@ def tries(sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fi
 
     tried += [Attempt(f, (None, None), *judge(f)) for f in leads if _long_enough(f, min_length_px)]
     for faint in (False, True):
-        if settled():
+        if settled() or late():
             break
         found = candidates(sheet, radius, min_length_px, faint)
         if not faint:
             seen = tuple(lines[0].points_px if lines else None for lines in found)
         go(by_lines(views, found))
-    if not settled() and (guess is not None or any(t.log_odds > PROMISING for t in tried)):
-        go(islice(_again(sheet, radius, found, tried, guess), CLOSER))
+    if not settled() and (guess is not None or any(t.log_odds > PROMISING for t in tried)) and not late():
+        go(islice(_again(sheet, radius, found, tried, guess, late), CLOSER))
     return tried, seen
 
 
-def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Guess | None) -> Iterator[Hypothesis]:
+def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Guess | None, late: Callable[[], bool]) -> Iterator[Hypothesis]:
     """Where else it may be, when no pair of lines settled it: where a guess leads; the likeliest fits without the lines beside them, and beside these; where
     the other plane shows what one plane's line alone says; and the likeliest again with a search around them."""
     path = None if guess is None else follow(sheet, guess, radius, clear=False)
@@ -101,6 +104,8 @@ def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Gues
     paths = []
     for k, (view, lines) in enumerate(zip(views, found)):
         for c in lines[:SWEPT]:
+            if late():
+                return
             path = sweep(undistort(view, c.points_px), (view, views[1 - k]), (dark[k], dark[1 - k]))
             if path is not None and path.share > SEEN:
                 paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (c, None)[::1 - 2 * k]))

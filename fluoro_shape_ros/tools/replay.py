@@ -212,7 +212,7 @@ class Results:
         reason = ': '.join(filter(None, (result.outcome.value, result.detail)))
         status = Status('reconstruction', level, '; '.join((reason, *result.warnings)), {
             'last outcome': result.outcome.value, 'last detail': result.detail, 'confidence': probability(result.confidence), 'warnings': ', '.join(result.warnings)})
-        out.write(DIAGNOSTICS, diagnostic_array([status], stamp, NODE, out.new), stamp)
+        out.write(DIAGNOSTICS, diagnostic_array([status], stamp, f'/{NODE}', out.new), stamp)
         if result.shape is not None:
             out.write_raw(names['backbone'], shapes.shape_to_path_cdr(result.shape, stamp, frame_id), stamp)
             out.write(names['tip'], shapes.shape_to_tip(result.shape, stamp, frame_id, out.new), stamp)
