@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.special import ndtr
 
-from fluoro_shape_ros.method.fit.ends import bulge, locate, supported
+from fluoro_shape_ros.method.fit.ends import bulge, level, locate, past_band, supported
 
 PX = 1 / 3000.0                                             # m a pixel
 S = np.arange(200) * PX
@@ -22,41 +22,80 @@ def presence(*planes, n=400):
     return out
 
 
+def stretch(presence, clutter=0.1):
+    """`supported` where places beside the device happen to look `clutter` dark."""
+    return supported(presence, np.full((2, 1), clutter))
+
+
 @pytest.mark.parametrize('a, b, found', [
     ([(50, 149)], [(50, 149)], (50, 149)),
     ([(50, 149)], [(80, 189)], (80, 149)),                                              # what both show
     ([(50, 149), (170, 299)], [(50, 149), (170, 299)], (50, 299)),                      # 20 px of nothing: bridged
-    ([(50, 149), (200, 299)], [(50, 149), (200, 299)], None),                           # 50 px of nothing: one of the two pieces
+    ([(50, 149), (350, 399)], [(50, 149), (350, 399)], (50, 149)),                      # 200 px of nothing: one of the two pieces
     ([(50, 299)], [(50, 149), (200, 299)], (50, 299)),                                  # 50 px hidden in one plane
-    ([(50, 299)], [(50, 149), (240, 299)], (50, 149)),                                  # 90 px hidden: the longer piece
+    ([(20, 119), (150, 157)], [(20, 119), (150, 157)], (20, 157)),                      # a band 30 px past the end of what is seen
+    ([(20, 119), (150, 157)], [(20, 119)], (20, 119)),                                  # which only one plane shows
+    ([(20, 119), (250, 257)], [(20, 119), (250, 257)], (20, 119)),                      # or too far off
 ])
 def test_the_stretch_that_both_planes_support(a, b, found):
-    first, last = supported(presence(a, b))
-    if found is None:
-        assert (first, last) in ((50, 149), (200, 299))
-    else:
-        assert_allclose((first, last), found, atol=1)
+    assert_allclose(stretch(presence(a, b)), found, atol=1)
 
 
 def test_the_longer_of_two_pieces_counts():
-    both = [(50, 129), (200, 299)]
-    assert_allclose(supported(presence(both, both)), (200, 299), atol=1)
+    apart = [(20, 69), (290, 399)]
+    assert_allclose(stretch(presence(apart, apart)), (290, 399), atol=1)
 
 
 @pytest.mark.parametrize('a, b', [([], []), ([(50, 149)], [(200, 299)]), ([(50, 52)], [(50, 52)])])
 def test_without_common_support_there_is_no_stretch(a, b):
-    assert supported(presence(a, b)) is None
+    assert stretch(presence(a, b)) is None
+
+
+def test_a_pale_part_counts_as_far_as_it_is_darker_than_places_beside_it():
+    p = presence([(50, 199)], [(50, 199)])
+    p[200:300] = 0.2
+    assert_allclose(stretch(p, 0.05), (50, 299), atol=2)
+    assert_allclose(stretch(p, 0.2), (50, 199), atol=1)
 
 
 def test_outside_a_field_is_no_support():
     p = presence([(50, 299)], [(50, 299)])
     p[200:, 1] = np.nan
-    assert_allclose(supported(p), (50, 199), atol=1)
+    assert_allclose(stretch(p), (50, 199), atol=1)
 
 
 def test_noise_moves_the_stretch_by_a_few_px_only():
     p = presence([(50, 299)], [(50, 299)]) + np.random.default_rng(0).normal(0, 0.25, (400, 2))
-    assert_allclose(supported(p), (50, 299), atol=4)
+    assert_allclose(stretch(p, 0.25 / 3), (50, 299), atol=4)
+
+
+@pytest.mark.parametrize('height, length_px, inner_px', [(1.0, 60, np.inf), (3.0, 8, 8), (0.3, 14, 14)])
+def test_how_dark_a_device_is_at_its_end_and_how_far_that_goes(height, length_px, inner_px):
+    """A plain end, one with a band, and a pale tip."""
+    inward = np.arange(-12, 60) * PX
+    p = np.where(inward < 0, 0.0, np.where(inward < length_px * PX, height, 1.0))
+    seen, inner = level(np.stack([p, p]), inward, PX)
+    assert_allclose(seen, height, rtol=0.15)
+    if np.isinf(inner_px):
+        assert inner == np.inf
+    else:
+        assert abs(inner / PX - inner_px) < 3
+
+
+@pytest.mark.parametrize('tip_px, clutter, expected_px, unsure_px', [(3, 0.03, 3, 0.6), (0, 0.03, 0, 0.6)])
+def test_a_pale_tip_past_a_band_is_measured_where_it_is_seen(tip_px, clutter, expected_px, unsure_px):
+    inward = np.arange(-16, 16.5, 0.5) * PX
+    p = np.select([inward < -tip_px * PX, inward < 0, inward < 6 * PX], [0.0, 0.4, 3.0], 0.4)
+    past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, clutter), PX)
+    assert abs(past / PX - expected_px) < 0.5 and sigma / PX < unsure_px
+
+
+def test_a_pale_tip_that_cannot_be_seen_makes_the_end_uncertain():
+    inward = np.arange(-16, 16.5, 0.5) * PX
+    p = np.select([inward < 0, inward < 6 * PX], [0.0, 3.0], 0.2)
+    past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, 2.0), PX)
+    assert 0.3e-3 < past < 0.7e-3 and 0.4e-3 < sigma < 0.8e-3          # half on none, half anywhere up to 2 mm
+    assert past_band(np.ones((2, len(inward))), inward, np.inf, np.full(2, 2.0), PX) == (0, 0)      # no band
 
 
 def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):

@@ -104,7 +104,8 @@ def test_which_end_is_the_tip_exchanges_what_is_said_of_the_ends():
     one, other = named(f, sheet, True), named(f, sheet, False)
     assert one['tip_aside'] == 0.7 and other['tip_aside'] == 0.2      # of both planes the darker
     assert one['tip_stops'] != other['tip_stops']
-    assert_same(one, other, 0, [n for n in NAMES if not n.startswith('tip')])
+    assert [one[f'base_{n}'] for n in ('stops', 'shown', 'farther')] == [other[f'tip_{n}'] for n in ('stops', 'shown', 'farther')]
+    assert_same(one, other, 0, [n for n in NAMES if not n.startswith(('tip', 'base'))])
 
 
 def test_a_quarter_of_the_dose_halves_the_signal_to_noise():

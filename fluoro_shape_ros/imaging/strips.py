@@ -15,6 +15,7 @@ from .parallel import both
 
 TOGETHER = 25           # strips along which a structured background errs the same way
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
+PALER, DARKER = 0.15, 4.0       # times as dark as it usually is, that a part of a device may be
 FOUND_PX = 0.3          # what `search` is worth
 MARGIN_PX = 4           # of a Sheet: interpolation reaches 2 px
 SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
@@ -48,6 +49,7 @@ class Measurement:
     presence: np.ndarray        # (V, N) 1: as dark as the device usually is, 0: nothing there
     presence_sigma: np.ndarray  # (V,) standard deviation of `presence` from noise
     noise: np.ndarray           # (V,) standard deviation of a sample
+    usual: np.ndarray           # (V, N) darkness, in image values, that `presence` is a share of
 
 
 def half_width_range(half_width_px: float) -> float:
@@ -212,12 +214,25 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     variance[~inside | odd | np.isnan(variance)] = np.inf
     sigma = np.array([n * g / middle(u) if np.isfinite(u[0]) else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
     offset[np.isnan(offset)] = 0.0
-    return Measurement(offset, variance, darkness / usual, sigma, noise[:, 0])
+    return Measurement(offset, variance, darkness / usual, sigma, noise[:, 0], usual)
 
 
 def darkness_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
     """(N, W) how dark a line with this (w,) shadow is at each place of (N, W) float32 profiles: a matched filter."""
     return -cv2.filter2D(profiles, cv2.CV_32F, (shadow - shadow.mean())[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
+
+
+def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int) -> np.ndarray:
+    """(V,) how dark places farther than `beside_px` from the middle of the strips happen to look, in image values: the standard deviation, from the median
+    (which few lines there do not move), of what a line with the (V, w) `shadows` of unit depth seems to be there, averaged over `along` strips."""
+    spread = np.empty(len(shadows))
+    for v, (profiles, shape) in enumerate(zip(strips.profiles, shadows)):
+        centred = shape - shape.mean()
+        dark = cv2.blur(darkness_across(profiles, shape), (1, along))[along // 2::along] / (centred @ centred)
+        x, half = strips.offsets_px, len(shape) // 2
+        beside = dark[:, (np.abs(x) > beside_px) & (np.abs(x) < x[-1] - half)]
+        spread[v] = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12
+    return spread
 
 
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
@@ -232,11 +247,12 @@ def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     at = np.clip(best, 1, response.shape[2] - 2)[..., None] + np.array([-1, 0, 1])
     before, darkest, after = np.moveaxis(np.take_along_axis(response, at, axis=2), 2, 0)
     beside = 0.5 * (before - after) / np.minimum(before - 2 * darkest + after, -1e-9)       # where the parabola through the three is highest
-    usual = [max(float(middle(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)]
-    strength = darkest / np.array(usual)[:, None]
+    usual = np.array([max(float(middle(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)])[:, None]
+    strength = darkest / usual
     believed = strips.inside & (strength > 0.4) & (strength < 2.5)
     unknown = np.ones(len(strength))
-    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5), np.where(believed, FOUND_PX**2, np.inf), strength, unknown, unknown)
+    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5), np.where(believed, FOUND_PX**2, np.inf), strength, unknown, unknown,
+                       np.broadcast_to(usual, strength.shape))
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:
@@ -248,5 +264,5 @@ def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np
     blocks = at[:len(at) // width * width].reshape(-1, width)
     medians = middle(values[blocks])
     overall = float(middle(medians))
-    medians = np.minimum(np.maximum(medians, 0.4 * overall), 2.5 * overall) if overall > 0 else medians
+    medians = np.minimum(np.maximum(medians, PALER * overall), DARKER * overall) if overall > 0 else medians
     return np.interp(np.arange(len(values)), blocks @ np.full(width, 1 / width), medians)

@@ -10,10 +10,11 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 
-from ..geometry.cameras import pixels_per_metre
+from ..geometry.cameras import depth, pixels_per_metre
 from ..geometry.curve import middle
+from ..geometry.spline import Spline3, through
 from ..imaging.strips import Sheet, Strips, cut
-from .fit.fit import Fit
+from .fit.fit import MAX_HALF_WIDTH_PX, Fit
 
 BLOCK = 12              # strips, along which darkness is averaged
 WIDER, BLUR_PX = 1.2, 1.0       # half a line's width is taken as so many times that of the device, and so much more for blur
@@ -22,6 +23,8 @@ CLEAR = 2.5             # signal to noise, at which a block is darker than nearl
 MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose closest-point mean is within the larger of these ...
 TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
+FARTHEST = 12.0         # nats, in the same way
+SKETCHED_PX = 2         # between the strips of a curve that was not fitted
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,17 @@ class Features:
     seen: float         # share of the blocks darker than nearly all places beside the curve
     symmetric: float    # odd part of the mean profile, as a share of its even part
     width: float        # |ln| of the width seen to that expected
+    uneven: float       # how differently, as a logarithm, the planes show its darkness change along it
     residual: float     # px rms, of the device from the curve
     sigma: float        # ln of the curve's, as a share of what it may be off by
     tip_stops: float    # how much darker it is before its tip than past it, as a share of its darkness
     tip_shown: float    # darkness of its last BLOCK before the tip, as a share of its darkness
+    base_stops: float   # the same of its base
+    base_shown: float
     tip_sigma: float    # ln of the tip's along the curve, as a share of what it may be off by
     tip_aside: float    # darkness of a line beside where it would go on
+    tip_farther: float  # nats by which both planes show it going on past its tip
+    base_farther: float
     no_tip: float       # 1 where it leaves the field at both ends
     length: float       # ln px
     hidden: float       # ends that only one plane shows
@@ -49,14 +57,7 @@ NAMES = tuple(f.name for f in fields(Features))
 def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.ndarray:
     """(len(NAMES),) of a fit of a device of `radius` m."""
     step = fit.s[1] - fit.s[0]
-    count = max(int((fit.stop - fit.start) / step), BLOCK)
-    s = np.linspace(fit.start, fit.stop, count)
-    s = np.concatenate([fit.start + step * np.arange(-PAST, 0), s, fit.stop + step * np.arange(1, PAST + 1)])
-    points, tangents = fit.spline.lines(s)
-    expected = [radius * pixels_per_metre(v.P, points[PAST:-PAST]) for v in sheet.views]
-    half = [WIDER * (h + BLUR_PX) for h in expected]
-    strips = cut(sheet, points, tangents, float(np.ceil(5.5 * max(half) + 10)), rough=True)
-    seen = [_plane(strips, v, half[v], expected[v], count) for v in (0, 1)]
+    seen, count = _seen(fit.spline, fit.start, fit.stop, step, sheet, radius)
     tip = int(tip_is_last)
     stops = np.min([p['stops'] for p in seen], axis=0)
     shown = np.min([p['shown'] for p in seen], axis=0)
@@ -65,15 +66,46 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
     between = (fit.s > fit.start) & (fit.s < fit.stop)
     left = [np.sqrt(np.nanmean(o[between]**2)) if np.isfinite(o[between]).any() else 3.0 for o in fit.offset_px.T]
     return np.array([
-        np.log(np.clip(min(p['run'] for p in seen), FAINTEST, CLEAREST)), min(p['share'] for p in seen), max(p['odd'] for p in seen),
-        max(abs(p['width']) for p in seen), min(max(left), 3.0),
+        *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
-        stops[tip], shown[tip], 0.0 if fit.open_end[tip] else tip_sigma, min(fit.aside[tip].max(), 2.0),
-        fit.open_end.all(), np.log(count), (fit.alone >= 0).sum()], float)
+        stops[tip], shown[tip], stops[1 - tip], shown[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, min(fit.aside[tip].max(), 2.0),
+        min(fit.farther[tip], FARTHEST), min(fit.farther[1 - tip], FARTHEST), fit.open_end.all(), np.log(count), (fit.alone >= 0).sum()], float)
 
 
-def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int) -> dict:
-    """What plane `v` shows of a curve with `count` strips, and PAST more past either end."""
+def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarray:
+    """(len(NAMES),) of a curve (N, 3) in m, known to a few px, that was not fitted: NaN for what that cannot tell yet."""
+    scale = [pixels_per_metre(v.P, points) for v in sheet.views]
+    if radius * max(scale) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in sheet.views) <= 0:
+        return np.array([dict(weakest=np.log(FAINTEST), seen=0.0).get(name, np.nan) for name in NAMES])     # it goes to a source
+    step = SKETCHED_PX / max(scale)
+    spline = through(points, 0.0)
+    seen, count = _seen(spline, spline.start, spline.stop, step, sheet, radius, round(BLOCK / SKETCHED_PX))
+    known = dict(zip(NAMES, _everywhere(seen)), length=np.log(count * SKETCHED_PX))
+    return np.array([known.get(name, np.nan) for name in NAMES])
+
+
+def _seen(spline: Spline3, start: float, stop: float, step: float, sheet: Sheet, radius: float, block: int = BLOCK) -> tuple[list[dict], int]:
+    """What each plane shows of a curve between two arc lengths, and the number of strips between them, `step` m apart and `block` of them in a block."""
+    count = max(int((stop - start) / step), block)
+    s = np.linspace(start, stop, count)
+    s = np.concatenate([start + step * np.arange(-PAST, 0), s, stop + step * np.arange(1, PAST + 1)])
+    points, tangents = spline.lines(s)
+    expected = [radius * pixels_per_metre(v.P, points[PAST:-PAST]) for v in sheet.views]
+    half = [WIDER * (h + BLUR_PX) for h in expected]
+    strips = cut(sheet, points, tangents, float(np.ceil(5.5 * max(half) + 10)), rough=True)
+    return [_plane(strips, v, half[v], expected[v], count, block) for v in (0, 1)], count
+
+
+def _everywhere(seen: list[dict]) -> tuple[float, ...]:
+    """The features of what each plane shows along all of a curve, in the order of NAMES."""
+    a, b = (np.log(np.clip(p['blocks'], 0.05, None)) for p in seen)
+    uneven = np.median(np.abs(a - b - np.median(a - b)))
+    return (np.log(np.clip(min(p['run'] for p in seen), FAINTEST, CLEAREST)), min(p['share'] for p in seen), max(p['odd'] for p in seen),
+            max(abs(p['width']) for p in seen), min(float(uneven), 3.0))
+
+
+def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, block: int) -> dict:
+    """What plane `v` shows of a curve with `count` strips, `block` of them in a block, and PAST more past either end."""
     x, profiles = strips.offsets_px, strips.profiles[v]
     flank = (np.abs(x) > half + 0.5) & (np.abs(x) <= 2 * half + 2)
     width = int(np.ceil(2 * half + 2))
@@ -82,8 +114,8 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int) ->
     outer = (np.abs(np.arange(-width, width + 1)) > half + 0.5)
     kernel[inner], kernel[outer] = -1 / inner.sum(), 1 / outer.sum()
     dark = cv2.filter2D(profiles, cv2.CV_32F, kernel[None], borderType=cv2.BORDER_REPLICATE)
-    number = count // BLOCK
-    blocks = dark[PAST:PAST + number * BLOCK].reshape(number, BLOCK, -1).mean(axis=1)
+    number = count // block
+    blocks = dark[PAST:PAST + number * block].reshape(number, block, -1).mean(axis=1)
     beside = blocks[:, (np.abs(x) > 2.5 * half + 2) & (np.abs(x) < x[-1] - width + 1)]
     spread = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12
     on = blocks[:, np.abs(x) <= 1].max(axis=1)
@@ -99,7 +131,7 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int) ->
     # a cylinder's chords have a standard deviation of half its radius
     seen_width = np.sqrt((positive * x[near]**2).sum() / (positive.sum() + 1e-12)) / np.hypot(radius_px / 2, BLUR_PX)
     each = dark[:, np.abs(x) <= 1].max(axis=1) / usual
-    ends = [(each[PAST:PAST + BLOCK].mean(), each[:PAST - 4].mean()), (each[PAST + count - BLOCK:PAST + count].mean(), each[PAST + count + 4:].mean())]
+    ends = [(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()), (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())]
     odd_share = np.sqrt((odd**2).sum() / ((even**2).sum() + 1e-12))
     return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0), width=float(np.log(np.clip(seen_width, 0.3, 3.0))),
-                stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))
+                blocks=on / usual, stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))

@@ -21,7 +21,7 @@ from ..imaging.strips import Sheet
 from . import judge, paper
 from .backbone import backbone
 from .checks import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
-from .features import MEAN, MEAN_PX, TIP, TIP_PX, features
+from .features import MEAN, MEAN_PX, TIP, TIP_PX, at_first_sight, features
 from .fit.fit import Fit, fit
 from .near import Near, predicted, tracked
 from .prediction import Guess, borne_out, informed, judged, look
@@ -73,7 +73,7 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
     if chosen is None:
         sheet = sheet_of(images, fields, frame.views, polarity)
         tried, lines = tries(sheet, radius, config.detection.min_length_px, partial(sized_up, sheet), lambda odds: model.settles(odds, enough),
-                             guess, leads, clock.late)
+                             guess, leads, clock.late, lambda points: float(model.log_odds(at_first_sight(points, sheet, radius))))
         clock.lap('search')
         if not tried:
             return _nothing(lines, config, clock)

@@ -26,6 +26,8 @@ SEEN = 0.6              # ... which must show this share of the line
 HOPELESS = -10.0        # log odds below which a fit that has not come to rest is left there ...
 PROMISING = -12.0       # ... and up to which nothing is worth a closer look ...
 CLOSER = 8              # ... at so many more hypotheses
+AS_PROPOSED = 2         # hypotheses that are fitted in the order in which they were proposed; the others in that of what is seen of them at first sight ...
+FITTED = 8              # ... as long as there are fewer than so many
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +47,14 @@ class Attempt:
 
 
 def tries(sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fit], tuple[np.ndarray, float, bool]], settles: Callable[[float], bool],
-          guess: Guess | None = None, leads: Sequence[Fit] = (), late: Callable[[], bool] = lambda: False) -> tuple[list[Attempt], tuple]:
+          guess: Guess | None = None, leads: Sequence[Fit] = (), late: Callable[[], bool] = lambda: False,
+          first_sight: Callable[[np.ndarray], float] | None = None) -> tuple[list[Attempt], tuple]:
     """All that was tried, and the line of each plane that stands out most, None where none does.
 
     judge: features and log odds of a fit, and whether its last end is the tip.
     settles: whether a fit with these log odds needs no other beside it. leads: fits that stand already.
     late: whether time is up, which once true stays so; asked before each step that takes long, and only where there is one left.
+    first_sight: log odds of a curve (N, 3) that was not fitted; without it hypotheses are tried as they are proposed.
     """
     views, tried, seen = sheet.views, [], (None, None)
 
@@ -82,10 +86,20 @@ def tries(sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fi
         found = candidates(sheet, radius, min_length_px, faint)
         if not faint:
             seen = tuple(lines[0].points_px if lines else None for lines in found)
-        go(by_lines(views, found))
+        hypotheses = by_lines(views, found)
+        go(hypotheses if first_sight is None else _most_promising(hypotheses, first_sight))
     if not settled() and (guess is not None or any(t.log_odds > PROMISING for t in tried)) and not late():
         go(islice(_again(sheet, radius, found, tried, guess, late), CLOSER))
     return tried, seen
+
+
+def _most_promising(hypotheses: Iterator[Hypothesis], first_sight: Callable[[np.ndarray], float]) -> Iterator[Hypothesis]:
+    """FITTED of them: the first as they come, the others by what is seen of them before any fit; those of the same two lines together."""
+    yield from islice(hypotheses, AS_PROPOSED)
+    others = list(hypotheses)
+    odds = [first_sight(h.curve) for h in others]
+    together = [max(o for o, other in zip(odds, others) if other.lines == h.lines) for h in others]
+    yield from islice((others[k] for k in sorted(range(len(others)), key=lambda k: (-together[k], -odds[k]))), FITTED - AS_PROPOSED)
 
 
 def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Guess | None, late: Callable[[], bool]) -> Iterator[Hypothesis]:

@@ -8,10 +8,14 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-PRESENT = 0.5           # of the usual darkness
-BRIDGED_PX = 70         # a stretch that only one plane shows, or none up to GAP_PX, does not end the device
-GAP_PX = 30
-SMOOTH_PX = 9
+PRESENT = 0.5           # of the darkness near an end: there it ends
+BRIDGED_PX = 70         # a stretch that not both planes show does not end the device
+SMOOTH_PX = 9           # along which darkness is averaged
+LOCAL_PX = 27           # at an end, that tell how dark the device is there
+PALEST = 0.03           # of the usual darkness: a paler device is not told from a background that is no parabola
+ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not within so many px
+BAND, SOFT_TIP = 3e-3, 2e-3     # m: longest marker band, and farthest that a device goes on past one at its end
+SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing is seen, since it may be pale
 REACH_PX = 12.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
@@ -21,20 +25,90 @@ DISAGREE_PX = 0.9       # what the planes' ends may differ by, beside noise
 FLOOR_PX = 0.12         # what the model of the edge itself is worth
 
 
-def supported(presence: np.ndarray, step_px: int = 1) -> tuple[int, int] | None:
-    """First and last index of the device's stretch of (N, 2) presence (NaN: outside the field), about `step_px` apart; None where there is none."""
-    known = np.where(np.isfinite(presence.T), np.minimum(np.maximum(presence.T, -1), 2), 0).astype(np.float32)      # a row a plane
-    a, b = cv2.blur(known, (SMOOTH_PX // step_px, 1), borderType=cv2.BORDER_REPLICATE) > PRESENT
-    both, either = a & b, a | b
-    at = np.nonzero(both)[0]
-    if len(at) < 5:
+def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1) -> np.ndarray:
+    """(N,) nats by which each strip of (2, N) presence (NaN: outside the field) speaks for a device that both planes show, about `step_px` apart.
+
+    clutter: (2, N) or (2, 1) how dark places beside the device happen to look over SMOOTH_PX. What a single plane shows may be another line: the other counts.
+    """
+    least = np.maximum(_both_show(presence / np.maximum(clutter, PALEST), max(SMOOTH_PX // step_px, 1)), 0.0)
+    return (np.minimum(0.5 * least * least, SURE) - ABSENT) * (step_px / SMOOTH_PX)
+
+
+def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1, gap_px: float = BRIDGED_PX) -> tuple[int, int] | None:
+    """First and last index of the device's stretch of (N, 2) presence, the one that most `evidence` speaks for, to where it is PRESENT of as dark as near
+    that end; None where there is none. Bands beyond a pale stretch no longer than `gap_px` belong to it, if they are clear enough."""
+    nats = evidence(presence.T, clutter, step_px)
+    seen = np.nonzero(nats > 0)[0]
+    for k in np.nonzero(np.diff(seen) * step_px > gap_px)[0]:
+        nats[seen[k] + 1:seen[k + 1]] = -np.inf
+    total = np.concatenate([[0.0], np.cumsum(np.maximum(nats.astype(float), -1e6))])
+    gain = total - np.minimum.accumulate(total)        # of the best stretch that stops there (Kadane 1977)
+    stop = int(gain.argmax())
+    if gain[stop] <= SURE / 2:
         return None
-    gaps = np.nonzero(np.diff(at) * step_px > GAP_PX)[0]
-    # a gap is bridged when it is short, or when one plane shows the device nearly all the way
-    cut = [g for g in gaps if not ((at[g + 1] - at[g]) * step_px <= BRIDGED_PX and either[at[g]:at[g + 1]].mean() > 0.8)]
-    starts, stops = [0, *(g + 1 for g in cut)], [*cut, len(at) - 1]
-    best = np.argmax([both[at[i]:at[j] + 1].sum() for i, j in zip(starts, stops)])
-    return int(at[starts[best]]), int(at[stops[best]])
+    start = int(total[:stop].argmin())
+    if (stop - start) * step_px < 5:
+        return None
+    dark = _both_show(presence.T, max(SMOOTH_PX // step_px, 1))[start:stop]
+    near = max(LOCAL_PX // step_px, 1)
+    first, last = (int((d > PRESENT * max(d[:near].max(), 1e-9)).argmax()) for d in (dark, dark[::-1]))
+    return (start + first, stop - 1 - last) if first + last < stop - start else None
+
+
+def level(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, float]:
+    """(2,) darkness of the device at an end in each plane, and how far inside that it stays so, in the units of `inward`: a band, or a pale tip, may be short.
+
+    presence: (2, N); inward: (N,) how far inside the end each strip lies; px: a pixel in these units.
+    """
+    order = np.nonzero((inward > -0.5 * px) & (inward < LOCAL_PX * px))[0]
+    order = order[np.argsort(inward[order])]
+    if len(order) < 3:
+        return np.ones(2), np.inf
+    step = max((inward[order[-1]] - inward[order[0]]) / (len(order) - 1) / px, 1e-3)
+    dark = _both_show(presence[:, order], max(round(5 / step), 1))
+    first = dark[:max(round(SMOOTH_PX / step), 1)]
+    peak = int(first.argmax())
+    height = max(float(first[peak]), PALEST)
+    other = (dark[peak:] < ALIKE * height) | (dark[peak:] * ALIKE > height)
+    until = peak + int(other.argmax()) if other.any() else len(order)
+    here = order[(np.arange(len(order)) >= min(peak, 3 / step)) & (np.arange(len(order)) < max(until, peak + 1))]
+    dark_here = np.median(_known(presence[:, here]), axis=1)
+    inner = max(inward[order[min(until, len(order) - 1)]], SHORTEST_PX * px) if other.any() else np.inf
+    return np.maximum(dark_here, PALEST), float(inner)
+
+
+def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: np.ndarray, px: float) -> tuple[float, float]:
+    """m by which the device goes on past a dark band that seems to be its end, and the standard deviation of that: a pale tip is often hardly seen.
+
+    presence: (2, N) at (N,) m inside the band's outer edge; inner: m, the band's length; clutter: (2,) see `evidence`. Posterior mean over lengths up to
+    SOFT_TIP, half of the prior on none, of a tip as dark as the device is behind the band. (0, 0) where there is no band.
+    """
+    behind, past = (inward > inner + 2 * px) & (inward < inner + LOCAL_PX * px), inward < -px
+    if inner > BAND or behind.sum() < 6 or past.sum() < 6:
+        return 0.0, 0.0
+    y = np.nan_to_num(presence)
+    band, pale = (np.median(y[:, m], axis=1) for m in ((inward > 0) & (inward < inner), behind))
+    if (pale > ALIKE * band).any():
+        return 0.0, 0.0
+    pale, out = np.maximum(pale, PALEST), -inward[past]
+    step = np.ptp(out) / (len(out) - 1)
+    lengths = np.linspace(0, SOFT_TIP, 21)
+    rest = y[:, past] - pale[:, None] * (out < lengths[:, None, None])
+    misfit = (rest * rest).sum(axis=2) @ (step / (SMOOTH_PX * px) / np.maximum(clutter, PALEST)**2)
+    p = np.exp(-0.5 * (misfit - misfit.min())) * np.where(lengths > 0, 1 / (len(lengths) - 1), 1.0)
+    p /= p.sum()
+    mean = float(p @ lengths)
+    return mean, float(np.sqrt(p @ (lengths - mean)**2))
+
+
+def _both_show(presence: np.ndarray, strips: int) -> np.ndarray:
+    """(N,) darkness that both planes show at least, of (2, N) presence averaged over so many strips: what only one shows is another line."""
+    return cv2.blur(_known(presence), (strips, 1), borderType=cv2.BORDER_REPLICATE).min(axis=0)
+
+
+def _known(presence: np.ndarray) -> np.ndarray:
+    """(2, N) float32, nothing where it is not known."""
+    return np.where(np.isfinite(presence), np.clip(presence, -99, 99), 0).astype(np.float32)
 
 
 def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.ndarray) -> np.ndarray:
@@ -76,18 +150,21 @@ class End:
 
 
 def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray, outward: np.ndarray, beyond: np.ndarray,
-           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX, blurs_px=BLURS_PX) -> list[End]:
+           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX, blurs_px=BLURS_PX, inner: np.ndarray | None = None) -> list[End]:
     """Where the device ends, for E ends at once.
 
     s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,) +1 for an end at large s, -1 at
     small. beyond: (E, 2) m, see `bulge`. ramp: (E, 2) m over which the end fades in each plane; the model is worth RAMP of that.
     density: strips a px, so many of which are one observation. reach_px: how far from the guess it is looked for.
+    inner: (E,) m, how far inside the guess the device is as dark as at its end (`level`); as far as is looked by default.
     Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
     clipped at 3.5 sigma. Where the planes differ by more than a standard deviation, but do not disagree, each counts by what its edge is worth.
     """
     e = np.arange(len(s))
     px_per_m = speed[e, :, np.abs(s - guess[:, None]).argmin(axis=1)].mean(axis=1)
     near = np.abs(s - guess[:, None]) * px_per_m[:, None] < reach_px + 12
+    if inner is not None:
+        near &= (guess[:, None] - s) * outward[:, None] < inner[:, None]
     at = np.minimum(near.argmax(axis=1)[:, None] + np.arange(near.sum(axis=1).max()), s.shape[1] - 1)
     y, speed, s, near = presence[e[:, None], :, at].transpose(0, 2, 1), speed[e[:, None], :, at].transpose(0, 2, 1), s[e[:, None], at], near[e[:, None], at]
     counted = near[:, None] & np.isfinite(y) & np.isfinite(sigma)[..., None]

@@ -13,12 +13,12 @@ import numpy as np
 
 from .neighbours import without_neighbours
 from ...geometry.curve import arc_length, middle
-from .ends import BLURS_PX, End, bulge, locate, supported
+from .ends import BLURS_PX, BRIDGED_PX, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
 from ...geometry.cameras import depth, pixels_per_metre
 from .solver import EndRow, Layout, Solution, solve
 from ...geometry.spline import Spline3, prolong, through
 from ...imaging.profiles import background, contrast_of, mean_profile, own_shadow, shadow, straight_on
-from ...imaging.strips import Measurement, Model, Sheet, Strips, cut, half_width_range, measure, search
+from ...imaging.strips import Measurement, Model, Sheet, Strips, clutter, cut, darkness_across, half_width_range, measure, search
 
 COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
@@ -29,12 +29,15 @@ SETTLED_PX = 0.1        # a fine round that moves the curve less is the last: st
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked at once
 NEAR_END_PX = 8
+ASTRAY = 0.04           # px a px, that it may bend away past an end
 GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
-GOES_ON, GOES_ON_ALONE = 0.25, 0.6     # darkness beyond an end, as a share of the usual, in both planes or in one, that makes one look farther ...
+GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far past its ends
+GOES_ON_BOTH = 3.0      # nats of evidence past an end that make one look farther ...
+GOES_ON_ALONE = 0.6     # ... or darkness there in one plane alone, as a share of the usual ...
 GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
@@ -58,6 +61,7 @@ class Fit:
     across: np.ndarray          # (2,) share of the beam that the device takes at its middle, after blur, as if seen straight on (Beer-Lambert)
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
+    farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, see `_Pair.farther`
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
     moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not come to rest
 
@@ -81,18 +85,18 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
     seen = pair.settle(through(points, beyond_px * step), (0.0, arc_length(points)[-1]), coarse, FINE)
     if seen is None:
         return None
-    seen, aside = pair.grow(seen)
+    seen, aside, farther = pair.grow(seen)
     s, look = seen.layout.s, partial(pair.look, seen.model)
-    found, ends = _finish(seen, aside, half_width, radius)
+    found, ends = _finish(seen, aside, farther, half_width, radius)
     agreed = _agree(found, ends, views)
     if agreed:
         strips, measured = look(found, s, seen.within)
         solution = solve(seen.layout, found.spline, strips, measured, views, seen.within, agreed)
         before = found.curve(2)
-        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, half_width, radius)
+        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, farther, half_width, radius)
         slid = np.linalg.norm(found.curve(2) - before, axis=1).max() / step      # in depth, which strips do not see
         found = replace(found, moved_px=max(found.moved_px, float(slid)))
-    return _see_ends(look, found, ends, half_width, radius)
+    return _see_ends(look, found, ends, half_width, radius, seen.clutter)
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,7 @@ class _Seen:
     measured: Measurement
     within: np.ndarray              # (N,) bool: the strips that counted
     model: Model
+    clutter: np.ndarray             # (2,) see strips.clutter
     stretch: tuple[int, int]        # first and last strip of the device
 
     @property
@@ -127,6 +132,7 @@ class _Pair:
     step: float             # m, a px of the finer plane
     reach: float            # px to either side of the curve
     template: np.ndarray    # (2, W) a cylinder's shadow
+    narrow: np.ndarray      # (2, w) the same, no wider than that
     cylinder: Model
     beside: list            # see profiles.background
     cleared: list | None    # px, the device's half width in each plane where the line beside it is taken away
@@ -142,7 +148,7 @@ class _Pair:
             return None     # it has left the images, or turns back and forth in them
         if coarse is not None:
             spline, reference = self._approach(spline, reference, coarse, near)
-        layout = Layout.of(spline, self.step)
+        layout, clutter = Layout.of(spline, self.step), self.clutter(spline, reference)
         for k in range(fine):
             strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
             within = (layout.s >= reference[0]) & (layout.s <= reference[1])
@@ -150,10 +156,10 @@ class _Pair:
             model = Model.of(own, strips.offsets_px)
             measured = measure(strips, model, within)
             solution = solve(layout, spline, strips, measured, views, within)
-            stretch = supported(measured.presence.T)
+            stretch = supported(measured.presence.T, clutter[:, None] / measured.usual, gap_px=self.gap_px)
             if stretch is None or (coarse is None and k == 0 and solution.moved_px > ASTRAY_PX):
                 return None
-            seen = _Seen(layout, solution, strips, measured, within, model, stretch)
+            seen = _Seen(layout, solution, strips, measured, within, model, clutter, stretch)
             spline, before, reference = solution.spline, reference, seen.reference
             if solution.moved_px < SETTLED_PX and np.abs(np.subtract(reference, before)).max() < 2 * self.step:
                 break
@@ -170,32 +176,60 @@ class _Pair:
             return spline, reference
         strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
         measured = measure(strips, self.cylinder, within)
-        stretch = supported(measured.presence.T, COARSE_STEP)
+        stretch = supported(measured.presence.T, self.clutter(spline, reference)[:, None] / measured.usual, COARSE_STEP, self.gap_px)
         if stretch is not None:
             reference = (layout.s[stretch[0]], layout.s[stretch[1]])
         return solve(layout, spline, strips, measured, views, within).spline, reference
 
-    def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
-        """The curve prolonged as long as that finds more of the device, straight on or beside it; and (2, 2) what then is aside, see `aside`."""
-        by, coarse = GROWTH_PX * self.step, int(self.cleared is None)     # a search would find the line beside the device again
+    @property
+    def gap_px(self) -> float:
+        """The longest stretch of the device that need not be seen."""
+        return max(GAP / self.step, BRIDGED_PX)
+
+    def clutter(self, spline: Spline3, reference: tuple[float, float]) -> np.ndarray:
+        """(2,) how dark places beside the curve between two arc lengths (m) happen to look in each plane, see strips.clutter."""
+        strips = cut(self.sheet, *spline.lines(np.arange(*reference, COARSE_STEP * self.step)), 2 * self.reach + WIDE_PX, rough=True)
+        return clutter(strips, self.narrow, self.reach, SMOOTH_PX // COARSE_STEP)
+
+    def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray, np.ndarray]:
+        """The curve prolonged as long as that finds more of the device, straight on or beside it; (2, 2) what then is aside, see `aside`, and (2,) what
+        says that it goes on still, see `farther`."""
+        coarse = int(self.cleared is None)     # a search would find the line beside the device again
         for _ in range(GROWTH):
             beyond, aside = seen.beyond, None
             known = ~np.isnan(beyond).any(axis=1)
-            goes_on = known & ((beyond > GOES_ON).all(axis=1) | (beyond > GOES_ON_ALONE).any(axis=1))
+            farther, nats = self.farther(seen)
+            goes_on = known & ((nats > GOES_ON_BOTH) | (beyond > GOES_ON_ALONE).any(axis=1))
             if not goes_on.any():
                 aside = self.aside(seen)
                 goes_on = known & (aside > GOES_ON_ASIDE).any(axis=1)
                 if not goes_on.any():
-                    return seen, aside
+                    return seen, aside, nats
+            by = max(GROWTH_PX, farther[nats > GOES_ON_BOTH].max(initial=0) + NEAR_END_PX) * self.step
             (start, stop), (spline, shift) = seen.reference, prolong(seen.solution.spline, goes_on, by)
             longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), coarse, FINE - 1, near=True)
             more = longer is not None and np.diff(longer.reference) - (stop - start) > NEAR_END_PX * self.step
             if not more and aside is not None:
-                return seen, aside      # that line is another one
+                return seen, aside, nats        # that line is another one
             seen = seen if longer is None else longer
             if not more:
                 break
-        return seen, self.aside(seen)
+        return seen, self.aside(seen), self.farther(seen)[1]
+
+    def farther(self, seen: _Seen) -> tuple[np.ndarray, np.ndarray]:
+        """(2,) px by which the device may go on past the first and the last end, straight on, perhaps beyond a gap; and (2,) nats that speak for that."""
+        px = np.arange(1, min(round(GAP / self.step), LOOK_PX), COARSE_STEP)
+        s = np.array(seen.reference)[:, None] + OUTWARD[:, None] * (px + SMOOTH_PX) * self.step
+        strips = cut(self.sheet, *seen.solution.spline.lines(s.ravel()), self.reach + WIDE_PX, rough=True)
+        far, nats, usual = np.zeros(2), np.zeros(2), middle(seen.measured.usual)[:, None]
+        for k in (0, 1):
+            mine = slice(k * len(px), (k + 1) * len(px))
+            straight = np.abs(strips.offsets_px) <= 1 + px[:, None] * ASTRAY     # it need not go on quite straight
+            dark = [np.where(straight, darkness_across(p[mine], t) / ((t - t.mean()) @ (t - t.mean())), -np.inf).max(axis=1) for p, t in zip(strips.profiles, self.narrow)]
+            total = np.cumsum(evidence(np.where(strips.inside[:, mine], dark, np.nan) / usual, seen.clutter[:, None] / usual, COARSE_STEP))
+            best = int(total.argmax())
+            far[k], nats[k] = px[best], max(float(total[best]), 0.0)
+        return far, nats
 
     def aside(self, seen: _Seen) -> np.ndarray:
         """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B."""
@@ -232,12 +266,13 @@ def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
 
 
 @lru_cache(64)
-def _looks(*half_width_cpx: int) -> tuple[float, np.ndarray, Model, list[np.ndarray]]:
+def _looks(*half_width_cpx: int) -> tuple[float, np.ndarray, np.ndarray, Model, list[np.ndarray]]:
     """How far strips reach, the shadow of a cylinder of so many hundredths of a px in each plane, and what a _Pair makes of it."""
     reach = half_width_range(max(half_width_cpx) / 100)
     offsets = np.arange(-reach, reach + 1)
     template = np.stack([shadow(h / 100, offsets) for h in half_width_cpx])
-    return reach, template, Model.of(template, offsets), [background(t, offsets) for t in template]
+    narrow = template[:, np.abs(offsets) <= 1.6 * max(half_width_cpx) / 100 + 3]
+    return reach, template, narrow, Model.of(template, offsets), [background(t, offsets) for t in template]
 
 
 def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
@@ -248,7 +283,7 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
-def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, list[End | None]]:
+def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width, radius) -> tuple[Fit, list[End | None]]:
     """The fit, and its ends where they are seen."""
     s, strips, seen, reference, solution = found.layout.s, found.strips, found.measured, found.reference, found.solution
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
@@ -260,15 +295,23 @@ def _finish(found: _Seen, aside: np.ndarray, half_width, radius) -> tuple[Fit, l
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])     # it runs out of a field before its end
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
-    ends = locate(twice(s), twice(seen.presence), twice(seen.presence_sigma), twice(strips.speed), np.array(reference), OUTWARD,
-                  *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2])
+    height, inner = _levels(twice(seen.presence), OUTWARD[:, None] * (np.array(reference)[:, None] - s), s[1] - s[0])
+    ends = locate(twice(s), twice(seen.presence) / height[..., None], twice(seen.presence_sigma) / height, twice(strips.speed), np.array(reference), OUTWARD,
+                  *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
     start_stop = [end.at for end in ends]
     for k in np.nonzero(open_end)[0]:
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
-               across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside), np.full(2, -1), solution.moved_px), ends
+               across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
+               np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
+
+
+def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray]:
+    """(2, 2) and (2,) of ends.level for both ends (rows): of (2, 2, N) presence, at (2, N) arc lengths inside them, m."""
+    height, inner = zip(*(level(p, i, px) for p, i in zip(presence, inward)))
+    return np.array(height), np.array(inner)
 
 
 def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -277,7 +320,7 @@ def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, r
     return bulge(radius, speed, px_per_m, across), radius * np.sqrt(1 - sine**2) / sine
 
 
-def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -> Fit:
+def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float, clutter: np.ndarray) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
     scale, step, by = np.array(half_width) / radius, f.s[1] - f.s[0], _shown_by_one(f)
     alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed(1 / step) else -1 for end, v in zip(ends, by)])
@@ -287,14 +330,18 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float) -
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
     presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))      # (ends, planes, strips)
     there = speed[:, :, len(window) // 2]
-    again = locate(s, presence, seen.presence_sigma.reshape(2, 2).T, speed, at, OUTWARD, *_shape_of_end(there, scale, f.across, radius),
-                   density=1 / END_STEP_PX, reach_px=END_REACH_PX)
+    height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
+    again = locate(s, presence / height[..., None], seen.presence_sigma.reshape(2, 2).T / height, speed, at, OUTWARD,
+                   *_shape_of_end(there, scale, f.across, radius), density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
     hard, sigma = crowded(f), np.zeros(2)
     for k, (end, v) in enumerate(zip(ends, alone)):
         if v >= 0 and np.isfinite(again[k].seen_at[v]):
             at[k], sigma[k], hard[k] = again[k].seen_at[v], again[k].seen_sigma[v], True
         elif end is not None:
             at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
+        if end is not None and inner[k] < np.inf:
+            further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]), clutter / middle(seen.usual.reshape(2, -1)), step)
+            at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
     return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone)
 

@@ -46,11 +46,11 @@ def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[
         back = epipolar_lines(F.T, b.reshape(-1, 2)).reshape(len(b), SAMPLES, 3)
         to_a = np.einsum('njk,ik->nij', back[..., :2], a[ia]) + back[:, None, :, 2]
         d = np.minimum(_distance_across(to_b, 2), _distance_across(to_a, 1))
-        gains.append(np.maximum(1 - (d / TOLERANCE_PX) ** 2, WORST))
+        gains.append(np.maximum(1 - (d / TOLERANCE_PX) ** 2, WORST).astype(np.float32))
     gain = np.stack(gains)                                                      # (na, nb, S, S)
     gain = np.stack([gain, gain[..., ::-1]], axis=2)                            # and B read backwards: (na, nb, 2, S, S)
-    step_a = (length_a / (SAMPLES - 1))[:, None, None, None]
-    step_b = (length_b / (SAMPLES - 1))[None, :, None, None]
+    step_a = (length_a / (SAMPLES - 1))[:, None, None, None].astype(np.float32)
+    step_b = (length_b / (SAMPLES - 1))[None, :, None, None].astype(np.float32)
     total = _fill(gain, step_a, step_b)
     flat = total.reshape(len(a), len(b), 2, -1)
     matched = flat.max(axis=3)
@@ -88,7 +88,7 @@ def _distance_across(signed: np.ndarray, axis: int) -> np.ndarray:
 def _fill(gain: np.ndarray, step_a, step_b) -> np.ndarray:
     """(..., S, S) best score of an alignment that ends at each pair of samples; rows one after another, all pairs of curves at once."""
     total = np.zeros_like(gain)
-    before = np.zeros(gain.shape[:-2] + (gain.shape[-1],))
+    before = np.zeros(gain.shape[:-2] + (gain.shape[-1],), gain.dtype)
     for i in range(gain.shape[-2]):
         g = gain[..., i, :]
         diagonal = np.concatenate([np.zeros_like(before[..., :1]), before[..., :-1]], axis=-1) + g * (step_a + step_b)

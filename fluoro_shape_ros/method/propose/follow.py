@@ -65,7 +65,7 @@ def follow(sheet: Sheet, guess: Guess, radius: float, clear: bool = True) -> np.
     if len(both) < 2 or clear and len(both) < SHORTEST * seen.sum(axis=1).max():
         return None
     shift = gaussian_filter1d(shifts[best].astype(float), SMOOTH, axis=1, mode='nearest')
-    path = Measurement(shift, np.where(seen, 1.0, np.inf), gain, np.ones(2), np.ones(2))
+    path = Measurement(shift, np.where(seen, 1.0, np.inf), gain, np.ones(2), np.ones(2), np.ones_like(shift))
     strips = Strips(centers, normals, speed, strength, shifts, seen, seen)
     moved = solve(layout, spline, strips, path, views, np.ones(len(layout.s), bool), near=False).spline
     return moved(np.linspace(layout.s[both[0]], layout.s[both[-1]], 200))

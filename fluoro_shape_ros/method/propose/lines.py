@@ -18,9 +18,9 @@ from ...imaging.strips import Sheet, cut_along, half_width_range
 from .alignment import align
 from .first_curve import first_curve
 
-LINES = 14              # strongest lines of an image that are looked at closely ...
-CANDIDATES = 8          # ... and most device-like ones among them that are compared between the planes
-ALIGNMENTS = 5          # of a line of each plane that are tried
+LINES = 40              # strongest lines of an image that are looked at closely ...
+CANDIDATES = 20         # ... and most device-like ones among them that are compared between the planes
+ALIGNMENTS = 30         # of a line of each plane that are proposed
 FLIPPED = 0.7           # score of a pair of lines read the other way round, as a share of the better way's, that must be tried, too
 UNLIKE, ODD = 0.3, 0.6  # difference to a cylinder's profile (correlation), and to its width (logarithm), that make a line less likely the device's
 FAINT_LENGTH_PX = 7.0   # sigma along which faint lines are averaged, in px of the smaller image

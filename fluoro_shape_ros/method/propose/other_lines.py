@@ -40,7 +40,7 @@ def other_lines(sheet: Sheet, f: Fit, radius: float) -> list[np.ndarray]:
     shifts = gaussian_filter1d(x[darkest_path(score, MOVE_COST)], SMOOTH, axis=1, mode='nearest')
     variance, found = np.where(within, 1.0, np.inf) * np.ones((2, 1)), []
     for plane in np.nonzero(np.abs(shifts[:, within]).max(axis=1) > OTHER_PX)[0]:
-        path = Measurement(shifts * (np.arange(2) == plane)[:, None], variance, np.ones_like(shifts), np.ones(2), np.ones(2))
+        path = Measurement(shifts * (np.arange(2) == plane)[:, None], variance, np.ones_like(shifts), np.ones(2), np.ones(2), np.ones_like(shifts))
         moved = solve(layout, f.spline, strips, path, sheet.views, within, near=False).spline
         found.append(moved(np.linspace(f.start, f.stop, 200)))
     return found
