@@ -11,6 +11,7 @@ EXECUTABLES = {
     'fluoro_shape_sim': 'fluoro_shape_ros.tools.sim',
     'fluoro_shape_import': 'fluoro_shape_ros.tools.importer',
     'fluoro_shape_replay': 'fluoro_shape_ros.tools.replay',
+    'fluoro_shape_calibrate': 'fluoro_shape_ros.tools.calibrate',
     'fluoro_shape_bench': 'fluoro_shape_ros.bench.main',
     'fluoro_shape_demo': 'fluoro_shape_ros.tools.demo',
     'fluoro_shape_servo_demo': 'fluoro_shape_ros.tools.servo_demo',

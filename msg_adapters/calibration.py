@@ -34,28 +34,41 @@ _MATRICES = {'K': ('camera_matrix', (3, 3)), 'P': ('projection_matrix', (3, 4)),
 
 
 def read_calibration(path) -> Calibration:
-    """The calibration in the file `path`.
+    """The calibration in the file `path`; `calibration_files` reads those of other programs.
 
     `rectification_matrix`, `distortion_model` and `distortion_coefficients` may be missing: none. Whether it can be a camera is for
     `camera_info_to_view` to say. Raises BadCalibration, OSError where there is no such file and ImportError without PyYAML.
     """
+    try:
+        return calibration_from(yaml_mapping(Path(path).read_bytes().decode()))
+    except UnicodeDecodeError as error:
+        raise BadCalibration(f'{path}: no YAML ({error})') from error
+    except BadCalibration as error:
+        raise BadCalibration(f'{path}: {error}') from None
+
+
+def yaml_mapping(text: str) -> dict:
+    """What a YAML text has by name. Raises BadCalibration and ImportError without PyYAML."""
     import yaml     # the only user of PyYAML among the adapters, which all else does without
 
     try:
-        content = yaml.safe_load(Path(path).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadCalibration(f'{path}: no YAML ({" ".join(str(error).split())})') from error
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise BadCalibration(f'no YAML ({" ".join(str(error).split())})') from error
     if not isinstance(content, dict):
-        raise BadCalibration(f'{path}: no calibration: the camera_info YAML format has fields by name')
+        raise BadCalibration('no calibration: the camera_info YAML format has fields by name')
+    return content
+
+
+def calibration_from(content: dict) -> Calibration:
+    """The calibration in the fields of the camera_info YAML format. Raises BadCalibration."""
     try:
         matrices = {key: _matrix(content[name], shape, name) for key, (name, shape) in _MATRICES.items()
                     if name in content or key in ('K', 'P')}
         return Calibration(camera_name=str(content.get('camera_name', '')), width=_size(content['image_width'], 'image_width'),
                            height=_size(content['image_height'], 'image_height'), distortion_model=str(content.get('distortion_model') or ''), **matrices)
     except KeyError as error:
-        raise BadCalibration(f'{path}: {error.args[0]} is missing') from None
-    except BadCalibration as error:
-        raise BadCalibration(f'{path}: {error}') from None
+        raise BadCalibration(f'{error.args[0]} is missing') from None
 
 
 def _matrix(entry, shape: tuple[int, int] | None, name: str) -> np.ndarray:

@@ -13,9 +13,10 @@ from fluoro_shape_ros.geometry.cameras import GeometryError, make_view
 from .messages import short
 
 LARGEST = 1e12      # no entry of a camera's matrices is beyond that, and arithmetic with it does not overflow
-LONGEST = 256       # characters of a frame_id, which every message of a result repeats
+LONGEST = 256       # characters of a frame_id, which every message of a result repeats, or of a model; coefficients of any kind
 MOST_COEFFICIENTS = 14      # that OpenCV knows
-COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}      # how many D may have
+COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}      # how many D may have, but for zeros after them
+NAMES = {'fisheye': 'equidistant'}      # of models that others call otherwise
 
 
 class BadCameraInfo(ValueError):
@@ -26,7 +27,9 @@ def check_lengths(msg, name: str) -> None:
     """Raises BadCameraInfo where what has no limit in plane `name`'s sensor_msgs/CameraInfo is too long to be kept, compared and repeated."""
     if len(msg.header.frame_id) > LONGEST:
         raise BadCameraInfo(f'plane {name}: its frame_id has {len(msg.header.frame_id)} characters, more than {LONGEST}')
-    if len(msg.d) > MOST_COEFFICIENTS:
+    if len(msg.distortion_model) > LONGEST:
+        raise BadCameraInfo(f'plane {name}: distortion model "{short(msg.distortion_model)}" has {len(msg.distortion_model)} characters, more than {LONGEST}')
+    if len(msg.d) > LONGEST or len(msg.d) > MOST_COEFFICIENTS and any(msg.d):     # zeros are a pinhole, however many
         raise BadCameraInfo(f'plane {name}: D has {len(msg.d)} coefficients, more than {MOST_COEFFICIENTS}')
 
 
@@ -108,13 +111,16 @@ def _distortion(msg, K: np.ndarray) -> Distortion | None:
         R = np.eye(3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise BadCameraInfo('R is no rotation')
-    if model and model not in COEFFICIENTS:
-        raise BadCameraInfo(f'distortion model "{short(model)}" is not one of {", ".join(COEFFICIENTS)}')
-    if model and D.size and D.size not in COEFFICIENTS[model]:
-        raise BadCameraInfo(f'{model} has {D.size} coefficients instead of {" or ".join(map(str, COEFFICIENTS[model]))}')
-    if not model and D.any():
+    if not D.any():     # as image_geometry has it, D of zeros is a pinhole under every model; R then still turns the rays
+        return None if np.allclose(R, np.eye(3), atol=1e-9) else Distortion('plumb_bob', K, np.zeros(5), R)
+    if not model:
         raise BadCameraInfo(f'D is given, but no distortion model: it must be one of {", ".join(COEFFICIENTS)}')
-    if D.any():
-        return Distortion(model, K, D, R)
-    # as image_geometry has it, D of zeros is a pinhole under every model; R then still turns the rays
-    return None if np.allclose(R, np.eye(3), atol=1e-9) else Distortion('plumb_bob', K, np.zeros(5), R)
+    model = NAMES.get(model, model)
+    if model not in COEFFICIENTS:
+        raise BadCameraInfo(f'distortion model "{short(model)}" is not one of {", ".join(COEFFICIENTS)}')
+    known = COEFFICIENTS[model]
+    if D.size > known[-1] and not D[known[-1]:].any():
+        D = D[:known[-1]]
+    if D.size not in known:
+        raise BadCameraInfo(f'{model} has {D.size} coefficients instead of {" or ".join(map(str, known))}')
+    return Distortion(model, K, D, R)

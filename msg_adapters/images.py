@@ -36,7 +36,15 @@ ENCODINGS = {
     '32FC1': _Encoding(_F32),
     'bgr8': _Encoding(_U8, 3, cv2.COLOR_BGR2GRAY),
     'rgb8': _Encoding(_U8, 3, cv2.COLOR_RGB2GRAY),
+    'bgra8': _Encoding(_U8, 4, cv2.COLOR_BGRA2GRAY),
+    'rgba8': _Encoding(_U8, 4, cv2.COLOR_RGBA2GRAY),
+    # luminance and half as much colour, two pixels in four bytes
+    'uyvy': _Encoding(_U8, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    'yuv422': _Encoding(_U8, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    'yuyv': _Encoding(_U8, 2, cv2.COLOR_YUV2GRAY_YUY2),
+    'yuv422_yuy2': _Encoding(_U8, 2, cv2.COLOR_YUV2GRAY_YUY2),
 }
+LUMINANCE_FIRST = ('nv12', 'nv21')      # all of it, and then half as many rows of colour
 MAX_PIXELS = 2**24      # 4096 x 4096, finer than X-ray detectors are: reconstructing a pair of these takes some seconds and 1.2 GB
 MAX_PARTS = 2**16       # of a file, that are looked at: a PNG of that size has some thousand chunks
 _WRITTEN_AS = {(_U8, 2): 'mono8', (_U16, 2): 'mono16', (_F32, 2): '32FC1', (_U8, 3): 'bgr8'}     # by dtype and number of dimensions
@@ -54,19 +62,21 @@ def image_to_array(msg) -> np.ndarray:
     A read-only view of the message's memory where that is possible: one channel, native byte order, aligned.
     Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, more than MAX_PIXELS, and values that are not finite.
     """
-    if msg.encoding not in ENCODINGS:
-        raise BadImage(f'encoding "{short(msg.encoding)}" is not one of {", ".join(ENCODINGS)}')
-    encoding = ENCODINGS[msg.encoding]
+    if msg.encoding not in ENCODINGS and msg.encoding not in LUMINANCE_FIRST:
+        raise BadImage(f'encoding "{short(msg.encoding)}" is not one of {", ".join((*ENCODINGS, *LUMINANCE_FIRST))}')
+    encoding = ENCODINGS.get(msg.encoding, ENCODINGS['mono8'])
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
     if height == 0 or width == 0:
         raise BadImage(f'the image is empty: {width}x{height}')
     item = encoding.dtype.itemsize * encoding.channels
     if step < width * item:
         raise BadImage(f'step {step} is too small: {width} {msg.encoding} pixels need {width * item} bytes a row')
-    size = len(msg.data)
+    if encoding.channels == 2 and width % 2:
+        raise BadImage(f'{msg.encoding} pixels come in twos, but the image is {width} wide')
+    size, rows = len(msg.data), height + (height + 1) // 2 if msg.encoding in LUMINANCE_FIRST else height
     # the last row may come without its padding
-    if not (height - 1) * step + width * item <= size <= height * step:
-        raise BadImage(f'data has {size} bytes, but {height} rows of step {step} need {height * step}')
+    if not (rows - 1) * step + width * item <= size <= rows * step:
+        raise BadImage(f'data has {size} bytes, but {rows} rows of step {step} need {rows * step}')
     check_pixels(height, width)
     order = '>' if msg.is_bigendian else '<'
     strides = (step, item, encoding.dtype.itemsize)

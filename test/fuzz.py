@@ -14,7 +14,8 @@ from typing import ClassVar
 
 import atheris
 
-with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.tools.dicom', 'fluoro_shape_ros.tools.dicom_pixels'],
+with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.tools.dicom', 'fluoro_shape_ros.tools.dicom_header',
+                                         'fluoro_shape_ros.tools.dicom_frames', 'fluoro_shape_ros.tools.dicom_geometry', 'fluoro_shape_ros.tools.dicom_pixels'],
                                 exclude=['pydicom._dicom_dict', 'pydicom._private_dict', 'pydicom._uid_dict', 'pydicom.sr']):
     import numpy as np
     from fuzz_seeds import COMPRESSED, IMAGE, INFO, PATH, TYPES, new, seeds

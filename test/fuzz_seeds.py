@@ -95,4 +95,5 @@ def xa_runs() -> list[bytes]:
     packed = pydicom.dcmread(io.BytesIO(found[0].getvalue()))
     packed.compress(uid.RLELossless)
     packed.save_as(file := io.BytesIO())
-    return [file.getvalue() for file in [*found, file]]
+    found += [file, xa.enhanced(io.BytesIO(), deep, [0.0, 5.0], [0.1, 0.2], PlaneIdentification='PLANE A')]
+    return [*(file.getvalue() for file in found), found[1].getvalue()[132:]]       # the last one without preamble

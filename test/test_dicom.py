@@ -255,7 +255,6 @@ def test_nothing_tells_whose_images_they_are(files):
     (dict(PositionerPrimaryAngleIncrement=[0, 1, 2]), 'PositionerPrimaryAngleIncrement has 3 values for 2 frames'),
     (dict(FrameTimeVector=[0, -1]), 'FrameTimeVector'),
     (dict(PhotometricInterpretation='RGB', SamplesPerPixel=3), 'only grey pixels of 8 or 16 bits are read, not RGB'),
-    (dict(SOPClassUID='1.2.840.10008.5.1.4.1.1.12.1.1'), 'an Enhanced XA image'),
     (dict(syntax=pydicom.uid.MPEG2MPML, pixel_data=encapsulate([b'12345678'] * 2)), 'compressed as MPEG2'),
     (dict(syntax=RLELossless, pixel_data=encapsulate([b'12345678'] * 2)), 'frame 1 can\'t be decoded'),
     (dict(ImageType=['ORIGINAL', 'PRIMARY', 'BIPLANE B']), 'both are of plane B'),

@@ -55,6 +55,37 @@ def test_colour_becomes_grey_by_its_luminance(padding):
     assert image_to_array(image('rgb8', [row], 12 + padding, width=4)).tolist() == [[76, 150, 29, 255]]
 
 
+@pytest.mark.parametrize('padding', [0, 3])
+def test_colour_with_transparency(padding):
+    row = bytes([255, 0, 0, 9, 0, 255, 0, 9, 0, 0, 255, 0, 255, 255, 255, 0])
+    assert image_to_array(image('bgra8', [row], 16 + padding, width=4)).tolist() == [[29, 150, 76, 255]]
+    assert image_to_array(image('rgba8', [row], 16 + padding, width=4)).tolist() == [[76, 150, 29, 255]]
+
+
+@pytest.mark.parametrize('padding', [0, 2, 5])
+@pytest.mark.parametrize('encoding, luminance', [('uyvy', 1), ('yuv422', 1), ('yuyv', 0), ('yuv422_yuy2', 0)])
+def test_of_luminance_and_colour_in_turn_the_luminance_is_taken(encoding, luminance, padding):
+    rows = [[1, 2, 250, 4], [16, 235, 0, 255]]
+    packed = [bytes(v for y in row for v in ((77, y) if luminance else (y, 77))) for row in rows]
+    assert image_to_array(image(encoding, packed, 8 + padding, width=4)).tolist() == rows
+
+
+@pytest.mark.parametrize('padding', [0, 3])
+@pytest.mark.parametrize('encoding', ['nv12', 'nv21'])
+def test_of_luminance_before_colour_the_luminance_is_taken(encoding, padding):
+    rows = [[1, 2, 250, 4], [16, 235, 0, 255]]
+    msg = image(encoding, [*map(bytes, rows), bytes([77] * 4)], 4 + padding, width=4, height=2)
+    assert image_to_array(msg).tolist() == rows
+    msg.data = msg.data[:2 * msg.step]
+    with pytest.raises(BadImage, match=f'data has {2 * msg.step} bytes, but 3 rows of step {msg.step} need {3 * msg.step}'):
+        image_to_array(msg)
+
+
+def test_pixels_that_come_in_twos_need_an_even_width():
+    with pytest.raises(BadImage, match='uyvy pixels come in twos, but the image is 3 wide'):
+        image_to_array(image('uyvy', [bytes(6)], 6, width=3))
+
+
 def test_the_last_row_may_come_without_its_padding():
     msg = image('mono8', [b'\x01\x02', b'\x03\x04'], 4, width=2)
     msg.data = msg.data[:6]

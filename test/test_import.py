@@ -14,6 +14,7 @@ from drawing import CALIBRATIONS, GOOD, RADIUS, SIZE                            
 
 from fluoro_shape_ros.tools import importer, replay    # noqa: E402
 from fluoro_shape_ros.tools.cli import ToolError    # noqa: E402
+from fluoro_shape_ros.tools.stamps import read_stamps   # noqa: E402
 from msg_adapters.bags import open_bag                                  # noqa: E402
 from msg_adapters.calibration import Calibration, write_calibration     # noqa: E402
 from msg_adapters.images import image_to_array                          # noqa: E402
@@ -94,6 +95,39 @@ def test_all_pages_of_a_file(folder):
     assert [image_to_array(m)[0, 0] for _, m in read()['/plane_a/image_raw']] == [300, 7]
 
 
+def test_videos_bring_their_rate(folder, capsys):
+    for p, pixels in zip('ab', GOOD):
+        writer = cv2.VideoWriter(f'{p}.avi', cv2.VideoWriter_fourcc(*'MJPG'), 20, (SIZE, SIZE), False)
+        for _ in range(3):
+            writer.write(pixels)
+        writer.release()
+    assert importer.main(arguments(plane_a=['a.avi'], plane_b=['b.avi'])) == 0
+    assert capsys.readouterr().out == '3 pairs in out\n'
+    images = read()['/plane_b/image_raw']
+    assert [log for log, _ in images] == [SECOND, 1_050_000_000, 1_100_000_000]
+    assert np.abs(image_to_array(images[1][1]).astype(int) - GOOD[1]).mean() < 3
+
+
+def test_a_rate_that_nobody_told_is_said(folder, capsys):
+    assert importer.main(arguments()) == 0
+    assert capsys.readouterr().out.splitlines() == ['2 pairs in out', 'no file tells the rate: 15 images/s are a guess; --rate or --stamps says it']
+    assert importer.main(arguments('--rate', '15', '--out', 'other')) == 0
+    assert capsys.readouterr().out == '2 pairs in other\n'
+
+
+def test_what_a_shell_makes_of_a_pattern_comes_in_the_order_of_its_numbers(folder):
+    assert importer.main(arguments(plane_a=['a/frame10.png', 'a/frame2.png'])) == 0
+    assert [image_to_array(m)[0, 0] for _, m in read()['/plane_a/image_raw']] == [2, 10]
+
+
+def test_another_order_than_that_of_the_numbers_is_said(folder, capsys):
+    (folder / 'a' / 'frame1.png').write_bytes((folder / 'a' / 'frame10.png').read_bytes())
+    names = ['a/frame2.png', 'a/frame10.png', 'a/frame1.png']       # as no shell sorts
+    assert importer.main(arguments('--rate', '15', plane_a=names, plane_b=['b/frame2.png', 'b/frame10.png', 'b/frame10.png'])) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == ['plane A: its images are taken in the order given, which is not that of the numbers in their names']
+    assert [image_to_array(m)[0, 0] for _, m in read()['/plane_a/image_raw']] == [2, 10, 10]
+
+
 def test_stamps_from_a_file_keep_their_nanoseconds(folder):
     (folder / 'stamps.txt').write_text('1795366364.835233992\n\n1795366365.058033953\n')
     assert importer.main(arguments('--stamps', 'stamps.txt')) == 0
@@ -125,9 +159,51 @@ def test_what_can_not_work_is_said_in_one_line(folder, capsys):
     assert 'short has 1 stamps for 2 pairs' in refused(capsys, '--stamps', 'short')
     assert 'none.yaml' in refused(capsys, '--camera-a', 'none.yaml')
     assert 'text.png: no calibration' in refused(capsys, '--camera-a', 'text.png')
-    assert 'coincide' in refused(capsys, '--camera-a', 'b.yaml')
+    assert 'camera_name "plane_b" was given for plane A' in refused(capsys, '--camera-a', 'b.yaml')
+    (folder / 'unnamed.yaml').write_text((folder / 'b.yaml').read_text().replace('camera_name: plane_b', 'camera_name: detector'))
+    assert 'coincide' in refused(capsys, '--camera-a', 'unnamed.yaml')
     assert 'a exists already' in refused(capsys, '--out', 'a')
     assert not (folder / 'out').exists()
+
+
+def test_a_stereo_pair_in_one_file_without_its_size_in_millimetres(folder, capsys):
+    """As OpenCV gives it: K, D and R, T from camera A, which is the reference frame, to camera B."""
+    poses = [np.vstack([np.linalg.solve(c.K, c.P), [0, 0, 0, 1]]) for c in CALIBRATIONS]
+    b_from_a = poses[1] @ np.linalg.inv(poses[0])
+    K = CALIBRATIONS[0].K
+    np.savez('stereo.npz', mtxL=K, distL=np.zeros(5), mtxR=K, distR=np.zeros(5), R=b_from_a[:3, :3], T=1e3 * b_from_a[:3, 3])
+    assert importer.main(arguments('--camera-a', 'stereo.npz', '--camera-b', 'stereo.npz', '--rate', '15')) == 0
+    assert capsys.readouterr().out.splitlines() == ['2 pairs in out', 'the calibrations are in mm, as a source stands 1131 from the origin; --unit says otherwise']
+    info = read()['/plane_b/camera_info'][0][1]
+    assert (info.width, info.height) == (SIZE, SIZE) and np.allclose(info.p.reshape(3, 4), K @ b_from_a[:3])
+
+
+@pytest.mark.parametrize('unit, metres', [('m', 1e3), ('mm', 1e-3)])
+def test_calibrations_that_are_not_in_metres_are_said(folder, capsys, unit, metres):
+    """A device of 1.2 mm is 1.2 px wide here. Lengths a thousand times as long, or a thousandth, make that 1/1000, or 1200."""
+    for p, c in zip('ab', CALIBRATIONS):
+        write_calibration(f'{p}.yaml', Calibration(c.camera_name, SIZE, SIZE, c.K, c.P * [1, 1, 1, 1e3 if unit == 'm' else 1]))
+    assert importer.main(arguments('--unit', unit, '--rate', '15')) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 2 and said[1].endswith('px wide where the planes look: are the calibrations in metres?')
+    assert f'1.2 mm thick would be {1.2 / metres:.3g} px' in said[1]
+
+
+@pytest.mark.parametrize('name, plane', [('plane_b', 'a'), ('PLANE A', 'b'), ('biplane_b_optical', 'a'), ('a', 'b')])
+def test_names_that_contradict_are_refused(folder, capsys, name, plane):
+    """A calibration, or a frame, of the other plane."""
+    (folder / 'c.yaml').write_text((folder / f'{plane}.yaml').read_text().replace(f'camera_name: plane_{plane}', f'camera_name: {name}'))
+    assert f'camera_name "{name}" was given for plane {plane.upper()}: are the planes exchanged?' in refused(capsys, f'--camera-{plane}', 'c.yaml')
+    frames = ['left', 'right']
+    frames['ab'.index(plane)] = name
+    assert f'frame_id "{name}" was given for plane {plane.upper()}' in refused(capsys, '--frame-ids', *frames)
+    assert not (folder / 'out').exists()
+
+
+@pytest.mark.parametrize('name', ['', 'detector', 'airplane_b', 'cab', 'plane_1', 'narrow_stereo/left', 'plane_a', 'A'])
+def test_names_that_tell_no_other_plane_pass(folder, name):
+    (folder / 'c.yaml').write_text((folder / 'a.yaml').read_text().replace('camera_name: plane_a', f'camera_name: "{name}"'))
+    assert importer.main(arguments('--camera-a', 'c.yaml')) == 0
 
 
 def test_a_calibration_that_is_no_camera_is_refused(folder, capsys):
@@ -140,7 +216,7 @@ def test_a_calibration_that_is_no_camera_is_refused(folder, capsys):
 def test_bad_stamps_are_named(tmp_path, text, says):
     (tmp_path / 'stamps').write_text(text)
     with pytest.raises(ToolError, match=f'stamps, {says}'):
-        importer.read_stamps(str(tmp_path / 'stamps'))
+        read_stamps(str(tmp_path / 'stamps'))
 
 
 def process(*given, code=None):

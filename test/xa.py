@@ -36,3 +36,27 @@ def logarithms(descriptor=(256, 0, 16)):
     table.LUTDescriptor, table.ModalityLUTType, table.LUTData = list(descriptor), 'US', [k * k for k in range(256)]
     table['LUTData'].VR, table['LUTDescriptor'].VR = 'US', 'SS' if min(descriptor) < 0 else 'US'
     return dict(PixelIntensityRelationship='LOG', ModalityLUTSequence=[table])
+
+
+CLASSIC = ('DistanceSourceToDetector', 'DistanceSourceToPatient', 'ImagerPixelSpacing', 'PositionerPrimaryAngle', 'PositionerSecondaryAngle', 'FrameTime',
+           'PixelIntensityRelationship')
+
+
+def item(**values):
+    """A dataset; a dict for a value is a sequence of one item."""
+    made = Dataset()
+    for keyword, value in values.items():
+        setattr(made, keyword, [item(**value)] if isinstance(value, dict) else value)
+    return made
+
+
+def enhanced(path, frames, angles, times=None, **attributes):
+    """An Enhanced XA file: distances and spacing shared, the primary angle of each frame, and its time in s, in a functional group of its own."""
+    shared = item(XRayGeometrySequence=dict(DistanceSourceToIsocenter=SOD, DistanceSourceToDetector=SID),
+                  FramePixelDataPropertiesSequence=dict(ImagerPixelSpacing=[PITCH, PITCH], PixelIntensityRelationship='LIN'))
+    own = []
+    for k, angle in enumerate(angles):
+        content = dict(FrameAcquisitionDateTime=f'20260102121314.{round(1e6 * times[k]):06d}') if times else dict(StackID='1')
+        own.append(item(PositionerPositionSequence=dict(PositionerPrimaryAngle=angle, PositionerSecondaryAngle=0.0), FrameContentSequence=content))
+    return make(path, frames, SOPClassUID='1.2.840.10008.5.1.4.1.1.12.1.1', **dict.fromkeys(CLASSIC) | dict(
+        SharedFunctionalGroupsSequence=[shared], PerFrameFunctionalGroupsSequence=own) | attributes)

@@ -1,151 +1,235 @@
-"""The projection of a plane from beads at known positions, as a calibration file: `python -m fluoro_shape_ros.tools.calibrate`.
-
-HZ is Hartley & Zisserman, Multiple View Geometry in Computer Vision, 2nd edition.
-"""
+"""fluoro_shape_calibrate: the calibration of one plane or of both, from beads at known positions or from pictures of a board; the registration of a robot."""
 
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
+from pathlib import Path
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.calibration import Calibration, write_calibration
+from msg_adapters.images import BadImage
 
-from ..geometry.cameras import GeometryError, decompose, depth, make_view, project, source
-from . import cli
+from ..geometry.cameras import GeometryError, check_pair, decompose, depth, make_view, source
+from ..pairing import PLANES
+from . import cli, register
+from .beads import Beads, CalibrationError, projection_from_points, read_beads, residuals_px, rms_px, triangulated_errors
+from .boards import Board, calibrate_camera, find_boards, place_second
+from .image_files import find_files
 
-MIN_BEADS = 6           # 11 unknowns, 2 equations a bead (HZ 7.1)
-MIN_SPREAD = 0.02       # of the 11th singular value against the first: beads as flat as 1:40 leave errors of several px between them
 SUSPICIOUS = 4.0        # a residual so many times the median is rather a mistaken bead than noise
-UNITS = {'m': 1.0, 'mm': 1e-3}
-
-
-class CalibrationError(ValueError):
-    """Beads that do not tell a projection; the message says why."""
-
-
-def projection_from_points(points: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
-    """(3, 4) P that maps (N, 3) points in m to (N, 2) pixels with the least squared reprojection error; |P[2, :3]| = 1, all points in front.
-
-    The direct linear transformation on normalised coordinates (HZ 7.1), then Levenberg-Marquardt on the pixels (HZ 7.2); no distortion.
-    Raises CalibrationError for fewer than MIN_BEADS, values that are not finite, points (nearly) in one plane, and points on both sides of the source.
-    """
-    points, pixels_px = np.asarray(points, float), np.asarray(pixels_px, float)
-    if len(points) != len(pixels_px) or len(points) < MIN_BEADS:
-        raise CalibrationError(f'{len(points)} beads and {len(pixels_px)} pixels: at least {MIN_BEADS} of both are needed')
-    if not (np.isfinite(points).all() and np.isfinite(pixels_px).all()):
-        raise CalibrationError('not all positions and pixels are finite')
-    T, U = _normalising(points), _normalising(pixels_px)
-    X, u = _homogeneous(points) @ T.T, _homogeneous(pixels_px) @ U.T
-    zero = np.zeros_like(X)
-    A = np.vstack([np.hstack([X, zero, -u[:, :1] * X]), np.hstack([zero, X, -u[:, 1:2] * X])])
-    _, sizes, directions = np.linalg.svd(A)
-    if sizes[10] < MIN_SPREAD * sizes[0]:
-        raise CalibrationError('the beads do not tell a projection: they lie (nearly) in one plane, or too few of them do not')
-
-    def residuals(p):
-        x = X @ p.reshape(3, 4).T
-        return (x[:, :2] / x[:, 2:] - u[:, :2]).ravel()
-    best = least_squares(residuals, directions[-1], method='lm', x_scale='jac', xtol=1e-14, ftol=1e-14, gtol=1e-14).x
-    P = np.linalg.inv(U) @ best.reshape(3, 4) @ T
-    P /= np.linalg.norm(P[2, :3])
-    P *= np.sign(np.median(depth(P, points)))
-    if (depth(P, points) <= 0).any():
-        raise CalibrationError('the best projection has beads on both sides of the X-ray source: beads and pixels do not belong together')
-    return P
-
-
-def residuals_px(P: np.ndarray, points: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
-    """(N,) px between (N, 3) reprojected points in m and the (N, 2) pixels."""
-    return np.linalg.norm(project(P, points) - pixels_px, axis=1)
-
-
-def pose_arguments(P: np.ndarray, reference: str, child: str) -> str:
-    """What static_transform_publisher needs to publish the pose of P's camera: frame `child` in frame `reference`."""
-    _, R, _ = decompose(P)
-    values = zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), (*source(P), *Rotation.from_matrix(R.T).as_quat()))
-    return ' '.join((f'--frame-id {reference} --child-frame-id {child}', *(f'--{name} {value:.9f}' for name, value in values)))
-
-
-def read_beads(path: str) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) positions in m and (N, 2) px from a CSV file with the columns x_mm, y_mm, z_mm (or x_m, y_m, z_m), u_px, v_px.
-
-    Raises CalibrationError for missing columns and for what is no number, OSError where there is no such file.
-    """
-    with open(path, newline='', encoding='utf-8-sig') as file:
-        rows = csv.DictReader(file, skipinitialspace=True)
-        names = [name.strip() for name in rows.fieldnames or ()]
-        rows.fieldnames = names
-        unit = next((unit for unit in UNITS if {f'{axis}_{unit}' for axis in 'xyz'} <= set(names)), None)
-        if unit is None or not {'u_px', 'v_px'} <= set(names):
-            raise CalibrationError(f'{path}: needs a first line with x_mm, y_mm, z_mm (or x_m, y_m, z_m), u_px and v_px, not {", ".join(names) or "an empty one"}')
-        columns = [f'{axis}_{unit}' for axis in 'xyz'] + ['u_px', 'v_px']
-        values = []
-        for row in rows:
-            try:
-                values.append([float(row[name]) for name in columns])
-            except (TypeError, ValueError):
-                raise CalibrationError(f'{path}: line {rows.line_num} has something that is no number') from None
-    table = np.array(values).reshape(-1, 5)
-    return table[:, :3] * UNITS[unit], table[:, 3:]
+MAX_RMS = 5.0           # px; no beads are found so badly that more than mistaken ones explains it
+FOCAL = 0.25, 200.0     # of the longer side of the image: from 127 degrees wide to 0.3
+MAX_OBLONG = 2.0        # focal length along rows against that along columns
+MAX_SKEW = 0.2          # of the focal length
 
 
 def main(argv=None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(
-        prog='python -m fluoro_shape_ros.tools.calibrate', description='The projection of one plane from beads at known positions, written as a camera_info YAML file.')
-    parser.add_argument('beads', metavar='CSV', help='columns x_mm, y_mm, z_mm (or x_m, y_m, z_m) in the reference frame, u_px, v_px: free of distortion; a line a bead')
-    parser.add_argument('--size', nargs=2, type=int, required=True, metavar=('WIDTH', 'HEIGHT'), help='of the image, px')
-    parser.add_argument('--out', required=True, metavar='YAML', help='the calibration file to write')
-    parser.add_argument('--name', default='', help='camera_name in the file')
-    parser.add_argument('--tf', nargs=2, metavar=('REFERENCE', 'CHILD'), help='for geometry:=tf: the file holds the intrinsics only, and the pose is printed')
-    return cli.run(_run, parser, argv)
+        prog='fluoro_shape_calibrate',
+        description='The calibration of one plane, or of both, as camera_info YAML files, from beads at known positions or from pictures of a board.')
+    parser.add_argument('beads', nargs='*', metavar='CSV',
+                        help='a table a plane: columns x_mm, y_mm, z_mm (or x_m, y_m, z_m) in the reference frame, u_px, v_px: free of distortion; a line a bead')
+    parser.add_argument('--size', nargs='+', type=cli.count, metavar='PX', help='WIDTH HEIGHT of the images, for both planes or for each; pictures have it in them')
+    for plane in PLANES:
+        parser.add_argument(f'--pictures-{plane}', nargs='+', metavar='FILES',
+                            help=f'instead of tables: pictures of a board by plane {plane.upper()}, those of both planes taken together, in pairs')
+    parser.add_argument('--board', nargs=2, type=cli.count, metavar=('COLUMNS', 'ROWS'), help='inner corners of the chessboard, or squares of the ChArUco board')
+    parser.add_argument('--square', type=cli.positive, metavar='MM', help='side of a square of the board')
+    parser.add_argument('--charuco', metavar='DICTIONARY', help='the board is a ChArUco board with markers of this dictionary of OpenCV, as DICT_4X4_50')
+    parser.add_argument('--marker', type=cli.positive, metavar='MM', help='side of a marker of the ChArUco board')
+    parser.add_argument('--register', metavar='CSV', help='instead: where a robot stands, from points that its tip was led to: columns robot_x_mm, robot_y_mm, robot_z_mm '
+                                                          'by its joints, x_mm, y_mm, z_mm as `tip` had them')
+    parser.add_argument('--out', nargs='+', default=[], metavar='YAML', help='the calibration files to write, one a plane')
+    parser.add_argument('--name', nargs='+', default=[], metavar='NAME', help='camera_name in the files (default: plane_a and plane_b where both are calibrated)')
+    parser.add_argument('--tf', nargs='+', metavar='FRAME',
+                        help='REFERENCE CHILD [CHILD], for geometry:=tf: the files hold the intrinsics only, and the poses are printed; '
+                             'with --register the reference frame and the robot\'s')
+    parser.add_argument('--force', action='store_true', help='overwrite the calibration files')
+    return cli.run(lambda args: _run(args, parser), parser, argv)
 
 
-def _run(args) -> None:
+def _run(args, parser: argparse.ArgumentParser) -> None:
+    if args.register:
+        if args.beads or args.out or args.size or args.pictures_a or args.pictures_b or len(args.tf or ()) != 2:
+            parser.error('--register: goes with --tf REFERENCE ROBOT and nothing else')
+        return _register(args)
     cli.need('yaml', 'bags')
+    pictures = [getattr(args, f'pictures_{p}') for p in PLANES]
+    planes = len(args.beads) or 1 + (pictures[1] is not None)
+    _check_arguments(args, parser, pictures, planes)
+    names = args.name or ([f'plane_{p}' for p in PLANES] if planes == 2 else [''])
+    inputs = args.beads or [file for given in pictures if given for file in map(str, find_files(given))]
+    _check_outputs(args.out, inputs, args.force)
     try:
-        points, pixels = read_beads(args.beads)
-        P = make_view(args.name, projection_from_points(points, pixels), *args.size).P
-    except (CalibrationError, GeometryError) as error:
+        cameras, lines = _from_beads(args, names) if args.beads else _from_pictures(args, names, pictures[:planes])
+    except (CalibrationError, GeometryError, BadImage) as error:
         raise cli.ToolError(str(error)) from error
+    print('\n'.join(lines))
+    for path, camera, child in zip(args.out, cameras, args.tf[1:] if args.tf else [None] * planes):
+        K, _, _ = decompose(camera.P)
+        written = Calibration(camera.camera_name, camera.width, camera.height, camera.K, np.c_[K, np.zeros(3)] if child else camera.P, camera.distortion_model, camera.D)
+        write_calibration(path, written)
+        if child:
+            print(f'ros2 run tf2_ros static_transform_publisher {pose_arguments(camera.P, args.tf[0], child)}')
+
+
+def _check_arguments(args, parser: argparse.ArgumentParser, pictures: list, planes: int) -> None:
+    if bool(args.beads) == bool(pictures[0]) or pictures[1] and not pictures[0] or len(args.beads) > 2:
+        parser.error('one table of beads, or two, or --pictures-a, or it and --pictures-b')
+    if args.beads and len(args.size or ()) not in (2, 2 * planes):
+        parser.error('--size: WIDTH HEIGHT of the images is required')
+    if args.beads and any((args.board, args.square, args.charuco, args.marker)) or args.size and not args.beads:
+        parser.error('--board, --square, --charuco and --marker belong to pictures, --size to tables')
+    if not args.beads and not (args.board and args.square) or bool(args.charuco) != bool(args.marker):
+        parser.error('pictures need --board and --square, and of a ChArUco board --charuco and --marker')
+    if args.board and min(args.board) < 3:
+        parser.error('--board: at least 3 each way')
+    if args.board and planes == 2 and not args.charuco and sum(args.board) % 2 == 0:
+        parser.error('--board: one number must be odd and the other even: such a board looks the same upside down to the planes')
+    if len(args.out) != planes or len(args.name) not in (0, planes) or args.tf and len(args.tf) != planes + 1:
+        parser.error(f'--out, --name and --tf: {"one file, name and child frame" if planes == 1 else "two files, names and child frames"} {"are" if planes == 2 else "is"} needed')
+
+
+def _check_outputs(outputs: list[str], inputs: list[str], force: bool) -> None:
+    """Raises ToolError before anything is computed that could not be written, or only over something else."""
+    if len({Path(path).resolve() for path in outputs}) < len(outputs):
+        raise cli.ToolError(f'{outputs[0]}: both planes can\'t be written to one file')
+    for path in map(Path, outputs):
+        if any(path.resolve() == Path(given).resolve() for given in inputs):
+            raise cli.ToolError(f'{path} is what is read, and is not overwritten')
+        if (path.exists() or path.is_symlink()) and not force:
+            raise cli.ToolError(f'{path} exists already and is not overwritten without --force')
+        if not path.parent.is_dir():
+            raise cli.ToolError(f'{path}: there is no folder {path.parent}')
+
+
+# ---- from beads
+
+
+def _from_beads(args, names: list[str]) -> tuple[list[Calibration], list[str]]:
+    """The cameras of the planes and what is to be said of them, a line each. Raises CalibrationError and GeometryError."""
+    tables, cameras, lines = [read_beads(path) for path in args.beads], [], []
+    for k, (path, name, beads) in enumerate(zip(args.beads, names, tables)):
+        size = tuple(args.size[-2:] if k else args.size[:2])
+        _check_inside(path, beads, size)
+        try:
+            P = make_view(name, projection_from_points(beads.points, beads.pixels_px), *size).P
+            check_fit(P, rms_px(residuals_px(P, beads.points, beads.pixels_px)), size)
+        except (CalibrationError, GeometryError) as error:
+            raise CalibrationError(f'{path}: {error}') from error
+        lines += [f'{name}: {line}' if len(names) > 1 else line for line in report(P, beads.points, beads.pixels_px, size)]
+        cameras.append(Calibration(name, *size, decompose(P)[0], P, 'plumb_bob', np.zeros(5)))
+    if len(cameras) == 2:
+        lines.append(_both(tables, cameras))
+    return cameras, lines
+
+
+def _check_inside(path: str, beads: Beads, size: tuple[int, int]) -> None:
+    """Raises CalibrationError where beads lie outside an image of this size: it is another image's."""
+    outside = np.flatnonzero(((beads.pixels_px < -0.5) | (beads.pixels_px > np.array(size) - 0.5)).any(axis=1))
+    if outside.size:
+        u, v = beads.pixels_px[outside[0]]
+        raise CalibrationError(f'{path}: {outside.size} of {len(beads.points)} beads lie outside an image of {size[0]}x{size[1]} px, the first is bead {outside[0] + 1} '
+                               f'at ({u:.1f}, {v:.1f}): is --size right?')
+
+
+def check_fit(P: np.ndarray, rms: float, size: tuple[int, int]) -> None:
+    """Raises CalibrationError for a projection that can be no X-ray plane or camera with images of this size, or does not fit its beads."""
     K, _, _ = decompose(P)
-    print('\n'.join(report(P, points, pixels)))
-    write_calibration(args.out, Calibration(args.name, *args.size, K, np.c_[K, np.zeros(3)] if args.tf else P, 'plumb_bob', np.zeros(5)))
-    if args.tf:
-        print(f'ros2 run tf2_ros static_transform_publisher {pose_arguments(P, *args.tf)}')
+    focal, longer = np.abs([K[0, 0], K[1, 1]]), max(size)
+    if rms > MAX_RMS:
+        raise CalibrationError(f'the best projection misses the beads by {rms:.1f} px rms: beads and pixels do not belong together, in this order')
+    if not (FOCAL[0] * longer < focal.min() and focal.max() < FOCAL[1] * longer):
+        raise CalibrationError(f'a focal length of {focal[0]:.0f} px with images {longer} px long makes no sense: are positions and pixels right?')
+    if focal.max() > MAX_OBLONG * focal.min() or abs(K[0, 1]) > MAX_SKEW * focal.min():
+        raise CalibrationError(f'focal lengths of {focal[0]:.0f} and {focal[1]:.0f} px and a skew of {K[0, 1]:.0f} px make no sense: are positions and pixels right?')
 
 
-def report(P: np.ndarray, points: np.ndarray, pixels_px: np.ndarray) -> list[str]:
+def report(P: np.ndarray, points: np.ndarray, pixels_px: np.ndarray, size: tuple[int, int]) -> list[str]:
     """What a person should compare with what is known of the system, a line each."""
     K, _, _ = decompose(P)
     r = residuals_px(P, points, pixels_px)
-    rms = np.sqrt(np.sum(r**2) / max(2 * len(r) - 11, 1))
-    lines = [f'{len(r)} beads, residual {rms:.3f} px rms a coordinate (11 unknowns counted), {r.max():.3f} px at worst (bead {r.argmax() + 1})',
+    lines = [f'{len(r)} beads, residual {rms_px(r):.3f} px rms a coordinate (11 unknowns counted), {r.max():.3f} px at worst (bead {r.argmax() + 1})',
              f'focal length {abs(K[0, 0]):.1f} px along rows, {K[1, 1]:.1f} px along columns, skew {K[0, 1]:.2f} px, principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f})',
              f'X-ray source at ({", ".join(f"{1e3 * x:.1f}" for x in source(P))}) mm, {1e3 * depth(P, points.mean(axis=0)):.1f} mm before the beads\' centre']
     if K[0, 0] < 0:
         lines.append('the image is mirrored (seen from the detector): that is fine')
     if r.max() > max(SUSPICIOUS * np.median(r), 0.5):
         lines.append(f'bead {r.argmax() + 1} fits much worse than the others: is it the right bead?')
+    if (pixels_px.max(axis=0) < np.array(size) / 2).all():
+        lines.append(f'all beads lie in the upper left quarter of {size[0]}x{size[1]} px: is --size right?')
     return lines
 
 
-def _normalising(points: np.ndarray) -> np.ndarray:
-    """(d + 1, d + 1) similarity that brings (N, d) points to the origin and to a distance of sqrt(d) on average (HZ 4.4.4)."""
-    center, d = points.mean(axis=0), points.shape[1]
-    scale = np.sqrt(d) / max(np.linalg.norm(points - center, axis=1).mean(), 1e-300)
-    T = np.diag([*[scale] * d, 1.0])
-    T[:d, d] = -scale * center
-    return T
+def _both(tables: list[Beads], cameras: list[Calibration]) -> str:
+    """What the beads that are in both tables say of the planes together. Raises CalibrationError and GeometryError."""
+    check_pair(tuple(make_view(p, c.P, c.width, c.height) for p, c in zip(PLANES, cameras)))
+    fitted = triangulated_errors(*tables, [c.P for c in cameras])
+    if not fitted.size:
+        return 'no bead is in both tables at one position: are both in one reference frame?'
+    left_out = triangulated_errors(*tables)
+    more = f'; {_rms_mm(left_out):.3f} mm rms where they are left out of the fit in turn' if not np.isnan(left_out).any() else ''
+    return f'both planes: {len(fitted)} beads triangulated, off by {_rms_mm(fitted):.3f} mm rms, {1e3 * fitted.max():.3f} mm at worst{more}'
 
 
-def _homogeneous(points: np.ndarray) -> np.ndarray:
-    return np.c_[points, np.ones(len(points))]
+def _rms_mm(errors: np.ndarray) -> float:
+    return 1e3 * float(np.sqrt(np.mean(errors**2)))
+
+
+# ---- from pictures
+
+
+def _from_pictures(args, names: list[str], pictures: list[list[str]]) -> tuple[list[Calibration], list[str]]:
+    """The same from pictures of a board; the reference frame is the optical frame of the first plane."""
+    board = Board(*args.board, args.square * 1e-3, (args.marker or 0) * 1e-3, args.charuco or '')
+    views = [find_boards(board, find_files(given)) for given in pictures]
+    if len({len(seen.corners) for seen in views}) > 1:
+        raise CalibrationError(f'{len(views[0].corners)} pictures of plane A and {len(views[1].corners)} of plane B: they must be taken together, in pairs')
+    cameras, lines = [], []
+    for seen, name in zip(views, names):
+        camera, rms = calibrate_camera(board, seen, name)
+        check_fit(camera.P, rms, seen.size)
+        K, D = camera.K, ', '.join(f'{d:.4g}' for d in camera.D)
+        said = (f'{sum(map(bool, seen.corners))} of {len(seen.corners)} pictures show the board, residual {rms:.3f} px rms a coordinate; focal length {K[0, 0]:.1f} px along rows, '
+                f'{K[1, 1]:.1f} px along columns, principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}), D = ({D})')
+        lines.append(f'{name}: {said}' if name else said)
+        cameras.append(camera)
+    if len(cameras) == 2:
+        cameras[1], rms, errors = place_second(board, tuple(views), tuple(cameras))
+        check_fit(cameras[1].P, rms, views[1].size)
+        lines.append(f'both planes: residual {rms:.3f} px rms a coordinate, {len(errors)} corners triangulated, off by {_rms_mm(errors):.3f} mm rms, '
+                     f'{1e3 * errors.max():.3f} mm at worst; {1e3 * np.linalg.norm(source(cameras[1].P)):.1f} mm apart; '
+                     f'the reference frame is the optical frame of {names[0]}')
+    return cameras, lines
+
+
+# ---- for tf
+
+
+def _register(args) -> None:
+    try:
+        robot, seen = register.read_touched(args.register)
+        R, t = register.fit_pose(robot, seen)
+    except CalibrationError as error:
+        raise cli.ToolError(str(error) if str(error).startswith(args.register) else f'{args.register}: {error}') from error
+    print(register.report(robot, seen, (R, t)))
+    print(f'ros2 run tf2_ros static_transform_publisher {transform_arguments(R, t, *args.tf)}')
+
+
+def pose_arguments(P: np.ndarray, reference: str, child: str) -> str:
+    """What static_transform_publisher needs to publish the pose of P's camera: frame `child` in frame `reference`."""
+    _, R, _ = decompose(P)
+    return transform_arguments(R.T, source(P), reference, child)
+
+
+def transform_arguments(R: np.ndarray, t: np.ndarray, reference: str, child: str) -> str:
+    """The same of a pose R (3, 3), t (3,) m of frame `child` in frame `reference`."""
+    values = zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), (*t, *Rotation.from_matrix(R).as_quat()))
+    return ' '.join((f'--frame-id {reference} --child-frame-id {child}', *(f'--{name} {value:.9f}' for name, value in values)))
 
 
 if __name__ == '__main__':

@@ -19,10 +19,15 @@ def run(body, parser: argparse.ArgumentParser, argv=None) -> int:
     argparse itself exits with 2 for unusable arguments; `parser.error` does the same for what only `body` can find.
     """
     args = parser.parse_args(argv)
+    return exit_code(lambda: body(args), parser.prog)
+
+
+def exit_code(work, program: str) -> int:
+    """What `work()` returns, 0 for None; 1 for a ToolError or OSError (one line on stderr), 130 for Ctrl-C."""
     try:
-        return body(args) or 0
+        return work() or 0
     except (ToolError, OSError) as error:
-        print(f'{parser.prog}: {" ".join(str(error).split())}', file=sys.stderr)
+        print(f'{program}: {" ".join(str(error).split())}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

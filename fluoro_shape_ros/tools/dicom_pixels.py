@@ -11,7 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from .dicom import BadDicom, XaRun, one_line, reading
+from .dicom import XaRun
+from .dicom_frames import check_whole, compressed_frames
+from .dicom_header import BadDicom, one_line, reading, words
 
 DECODER = 'fluoro_shape_ros.tools.dicom_decoder'
 
@@ -26,21 +28,25 @@ class Table:
 
 
 def pictures(run: XaRun) -> Iterator[np.ndarray]:
-    """The (H, W) uint8 or uint16 frames as stored: windows are for displays and not applied, MONOCHROME1 is turned over, so that the device is dark.
+    """The (H, W) uint8 or uint16 frames as stored: windows are for displays and not applied; MONOCHROME1, which is INVERSE by another name, is turned
+    over, so that the device is dark.
 
     Values that are logarithms of the intensity (LOG) become intensities where the file has the table for it (Modality LUT), else they stay.
     Raises BadDicom where a frame can't be decoded.
     """
     header, table, number = run.header, modality_table(run), 0
     full = 2 ** (table.bits if table else stored_bits(header)) - 1
+    inverse = header.PhotometricInterpretation == 'MONOCHROME1' or words(header, 'PresentationLUTShape') == ['INVERSE']
     check_frames(run)
     for frame in decoded(run) if header.file_meta.TransferSyntaxUID.is_encapsulated else uncompressed(run):
         frame, number = stored_values(frame, header), number + 1
         if table:
             frame = table.values[np.clip(frame.astype(np.int32) - table.first, 0, len(table.values) - 1)]
-        yield np.ascontiguousarray(full - frame if header.PhotometricInterpretation == 'MONOCHROME1' else frame)
-    if number != len(run.calibrations):
-        raise BadDicom(f'{run.path}: truncated: {number} of {len(run.calibrations)} frames are there')
+        yield np.ascontiguousarray(full - frame if inverse else frame)
+    if number != run.count:
+        raise BadDicom(f'{run.path}: truncated: {number} of {run.count} frames are there')
+    if header.file_meta.TransferSyntaxUID.is_encapsulated:
+        check_whole(run.path, header, run.count)
 
 
 def uncompressed(run: XaRun) -> Iterator[np.ndarray]:
@@ -48,12 +54,13 @@ def uncompressed(run: XaRun) -> Iterator[np.ndarray]:
     from pydicom.pixels import iter_pixels
 
     with reading(run.path, 'its frames'):       # pydicom takes the lowest BitsStored bits wherever HighBit is
-        yield from iter_pixels(run.path, raw=True, bits_stored=int(run.header.BitsAllocated))
+        yield from iter_pixels(run.path, indices=range(run.count), raw=True, bits_stored=int(run.header.BitsAllocated),
+                               transfer_syntax_uid=run.header.file_meta.TransferSyntaxUID)
 
 
 def decoded(run: XaRun) -> Iterator[np.ndarray]:
     """The frames of a compressed run, see dicom_decoder. Raises BadDicom."""
-    with tempfile.TemporaryFile() as said, subprocess.Popen([sys.executable, '-m', DECODER, str(run.path)], stdout=subprocess.PIPE, stderr=said) as child:
+    with tempfile.TemporaryFile() as said, subprocess.Popen([sys.executable, '-m', DECODER, str(run.path), str(run.count)], stdout=subprocess.PIPE, stderr=said) as child:
         number = 0
         try:
             while child.stdout.peek(1):
@@ -97,7 +104,7 @@ def stored_values(frame: np.ndarray, header) -> np.ndarray:
     """The unsigned values in the bits from HighBit down; signed ones are raised so that the lowest is 0."""
     bits, dtype = stored_bits(header), np.uint8 if int(header.BitsAllocated) == 8 else np.uint16
     shift = int(header.get('HighBit') or bits - 1) + 1 - bits
-    values = (frame.view(dtype) >> dtype(shift)) & dtype(2**bits - 1)
+    values = (frame.astype(frame.dtype.newbyteorder('='), copy=False).view(dtype) >> dtype(shift)) & dtype(2**bits - 1)
     return values ^ dtype(2 ** (bits - 1)) if header.get('PixelRepresentation') else values
 
 
@@ -108,27 +115,13 @@ def check_frames(run: XaRun) -> None:
     declared = int(run.header.Columns), int(run.header.Rows), 1
     if run.header.file_meta.TransferSyntaxUID == RLELossless or not run.header.file_meta.TransferSyntaxUID.is_encapsulated:
         return      # which say nothing else
-    for number, frame in enumerate(compressed_frames(run), 1):
+    for number, frame in enumerate(compressed_frames(run.path, run.header, run.count), 1):
         found = codestream_size(frame)
         if found is None:
             raise BadDicom(f'{run.path}: frame {number} can\'t be decoded: it does not say how large it is')
         if found != declared:
             inside = f'{found[0]}x{found[1]} px' + (f' of {found[2]} colours' if found[2] != 1 else '')
             raise BadDicom(f'{run.path}: frame {number} is {inside} inside, but {declared[0]}x{declared[1]} by the header')
-
-
-def compressed_frames(run: XaRun) -> Iterator[bytes]:
-    """The frames as they are in the file. Raises BadDicom."""
-    import pydicom
-    from pydicom.encaps import generate_frames
-    from pydicom.tag import Tag
-
-    offsets = run.header.get('ExtendedOffsetTable'), run.header.get('ExtendedOffsetTableLengths')
-    with run.path.open('rb') as file:
-        with reading(run.path, 'its compressed frames'):
-            pydicom.dcmread(file, stop_before_pixels=True, specific_tags=[Tag('Rows')])
-            file.seek(12, 1)        # tag, VR and length of the pixel data
-            yield from generate_frames(file, number_of_frames=len(run.calibrations), extended_offsets=offsets if all(offsets) else None)
 
 
 def codestream_size(frame: bytes) -> tuple[int, int, int] | None:

@@ -6,9 +6,11 @@ thread, ahead of the reconstruction.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
+import re
 import sys
 import time
 from bisect import bisect_right
@@ -31,22 +33,25 @@ from ..config import Config
 from ..data import Frame, Outcome, Reconstruction
 from ..pairing import PLANES, Counts, Pairer
 from ..method.pipeline import reconstruct
-from ..worker import Camera, Job, Memory, adapt, camera, checked_camera, decode, image_window, view_of
+from ..worker import Camera, Job, Lookup, Memory, adapt, camera, checked_camera, decode, image_window, view_of
 from .cli import ToolError
+from .recorded_tf import RecordedPoses, read_poses
 
 MAX_NS = 2**63 - 1
 LATE_NS = 10**9         # a camera info is not recorded later than this after the image for which it holds
 AHEAD = 8               # images read before they are asked for
 BAR = '{l_bar}{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]'
+NUMBERS = re.compile(r'-?\d+(\.\d+)?(e[-+]?\d+)?')
 Copy = Callable[[object, int], None]    # takes a Recorded and its stamp in ns
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Where the images and camera infos of a bag are: absolute topic -> plane."""
+    """Where the images and camera infos of a bag are: absolute topic -> plane; and its tf messages, -> tf or tf_static."""
 
     images: dict[str, str]
     infos: dict[str, str]
+    tf: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -56,14 +61,18 @@ class Summary:
     counts: Counts = field(default_factory=Counts)
     images: Counter = field(default_factory=Counter)        # by plane
     outcomes: Counter = field(default_factory=Counter)      # by name
+    reasons: Counter = field(default_factory=Counter)       # by name of the outcome and why, of pairs without a result; numbers left out
     warnings: Counter = field(default_factory=Counter)
     refused: dict[str, str] = field(default_factory=dict)   # plane -> why its last refused camera info was
+    frames: dict[str, tuple[str, str]] = field(default_factory=dict)    # plane -> frame_id of an image, and another one of the camera info that held for it
     masked: int = 0                                         # pairs that made the mask
     bug: str = ''                                           # what went wrong in the first pair that ended in internal_error
 
     def count(self, stamp: int, result: Reconstruction) -> None:
         """One more pair came to an end."""
         self.outcomes[result.outcome.value] += 1
+        if result.shape is None and result.detail:
+            self.reasons[result.outcome.value, NUMBERS.sub('...', ' '.join(result.detail.split()))] += 1
         self.warnings.update(result.warnings)
         if result.outcome is Outcome.INTERNAL_ERROR:
             self.bug = self.bug or f'{result.detail} (stamp {stamp / 1e9:.3f} s)'
@@ -105,22 +114,26 @@ class Offline:
         self._pairer, self._memory = Pairer(round(config.input.sync_slop * 1e9)), Memory()
         self._views = lru_cache(maxsize=8)(view_of)
         self._cameras: dict[str, list[tuple[int, Camera]]] = {}
+        self._poses: RecordedPoses | None = None    # with geometry: tf
 
     def answers(self) -> Iterator[Answer]:
         """One answer a pair, in the order of the bag. Raises ToolError where no images pair."""
         cv2.setNumThreads(self._config.input.threads or -1)     # 0 would mean none for OpenCV
         self._cameras = read_cameras(self._bag, self._config, self._topics.infos, self.summary, self._span[1], self._copy)
+        if self._config.input.geometry == 'tf':
+            self._poses = read_poses(self._bag, self._topics.tf, self._copy)
         span, summary = self._span, self.summary
         if self._mask_s:
             until_ns = self._bag.start_ns + round(self._mask_s * 1e9)
             span = max(span[0], until_ns), span[1]
-            summary.masked = take_mask((job for job, _ in self._jobs('mask', (self._bag.start_ns, until_ns))), self._memory, self._views)
+            summary.masked = take_mask((job for job, _ in self._jobs('mask', (self._bag.start_ns, until_ns))), self._memory, self._views, self._poses)
             if not summary.masked:
                 raise ToolError(f'--mask {self._mask_s:g}: there is no usable pair in the first {self._mask_s:g} s of the bag')
         for job, log_ns in self._jobs('replaying', span):
             begin = time.perf_counter()
-            frame, result = answer(job, self._memory, self._views)
+            frame, result = answer(job, self._memory, self._views, self._poses)
             summary.count(job.stamp_ns, result)
+            summary.counts = dataclasses.replace(self._pairer.counts)   # as far as it got, should it be interrupted
             yield Answer(job, frame, result, time.perf_counter() - begin, log_ns)
         summary.counts = dataclasses.replace(self._pairer.counts, unpaired=self._pairer.counts.unpaired + self._pairer.waiting)
         if not summary.outcomes:
@@ -134,13 +147,17 @@ class Offline:
             pictures += itertools.islice(map(self._picture, self._bag.messages(topics, log_ns, log_ns + 1)), 1)
         if len(pictures) < 2:
             return None
-        frame = adapt(dataclasses.replace(given.job, images=tuple(p.pixels for p in pictures)), self._views, None, Tally())
+        frame = adapt(dataclasses.replace(given.job, images=tuple(p.pixels for p in pictures)), self._views, self._poses, Tally())
         return frame if isinstance(frame, Frame) else None
 
     def _jobs(self, what: str, span: tuple[int, int]) -> Iterator[tuple[Job, tuple[int, int]]]:
         """The pairs of a span of log times with all that holds for them, and their log times."""
         for stamp_a, *pair in self._pairs(what, span):
             held = tuple(camera_at(self._cameras[p.plane], p.stamp_ns) for p in pair)
+            for p, known in zip(pair, held):
+                frame_ids = p.recorded.message.header.frame_id, known.msg.header.frame_id if known else ''
+                if all(frame_ids) and frame_ids[0] != frame_ids[1]:
+                    self.summary.frames[p.plane] = frame_ids
             job = Job(stamp_a, tuple(p.pixels for p in pair), held, self._config, self._memory.generation, 0.0)
             yield job, tuple(p.log_ns for p in pair)
 
@@ -163,10 +180,10 @@ class Offline:
         return max(span[0], self._bag.start_ns), min(span[1], self._bag.end_ns)
 
     def _picture(self, recorded) -> Picture:
-        try:
-            pixels = decode(recorded.message)
-        except BadImage:        # is named when its turn comes
-            pixels = recorded.message
+        pixels = recorded.message
+        if self._poses is None:     # whose stamps are asked for with the poses
+            with contextlib.suppress(BadImage):     # is named when its turn comes
+                pixels = decode(recorded.message)
         return Picture(self._topics.images[recorded.topic], stamp_ns(recorded.message), recorded.log_ns, pixels, recorded)
 
     def _nothing(self) -> str:
@@ -232,19 +249,19 @@ def camera_at(known: list[tuple[int, Camera]], stamp: int) -> Camera | None:
     return known[max(bisect_right(known, stamp, key=itemgetter(0)) - 1, 0)][1] if known else None
 
 
-def take_mask(jobs: Iterable[Job], memory: Memory, views) -> int:
+def take_mask(jobs: Iterable[Job], memory: Memory, views, lookup: Lookup | None = None) -> int:
     """Make the mean of pairs of messages the mask; how many these were. Bad ones are left out."""
     memory.capture_mask(sys.maxsize)
     for job in jobs:
-        frame = adapt(job, views, None, Tally())
+        frame = adapt(job, views, lookup, Tally())
         if isinstance(frame, Frame):
             memory.take_for_mask(frame, image_window(job, frame))
     return memory.finish_mask()
 
 
-def answer(job: Job, memory: Memory, views) -> tuple[Frame | None, Reconstruction]:
+def answer(job: Job, memory: Memory, views, lookup: Lookup | None = None) -> tuple[Frame | None, Reconstruction]:
     """The frame of a pair of images, None where they can't be one, and the answer."""
-    frame = adapt(job, views, None, Tally())
+    frame = adapt(job, views, lookup, Tally())
     if isinstance(frame, Reconstruction):
         return None, frame
     try:

@@ -1,13 +1,14 @@
 """fluoro_shape_replay: a recorded bag in, a bag with results out; offline, without DDS, and the same output every time.
 
 Every result is logged at the stamp of plane A's image. The images and camera infos are not copied unless --with-images says so: they
-are most of a bag, and `ros2 bag play` plays two bags at once.
+are most of a bag.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import sys
 from collections.abc import Iterable
@@ -19,10 +20,13 @@ from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, diagnostic
 from ..config import Config, ConfigError
 from ..data import Outcome
 from ..pairing import PLANES
-from .cli import ToolError, need, run
-from .exports import Arrays, Table
-from .offline import Answer, Offline, Summary, Topics
+from .cli import ToolError, count, need, run
+from .exports import Arrays, Table, writing
+from .offline import Answer, Offline, Topics
 from .parameters import NODE, read_parameters
+from .recorded_tf import NAMES as TF
+from .recorded_tf import TF_TYPE
+from .summary import as_json, report
 
 IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 DIAGNOSTICS = '/diagnostics'
@@ -37,9 +41,18 @@ INPUTS = tuple(f'plane_{plane}/{what}' for plane in PLANES for what in ('image_r
 
 def main(argv=None) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog='fluoro_shape_replay', description='Reconstruct backbone and tip from a recorded bag (rosbag2: MCAP or sqlite3, compressed or not).')
-    parser.add_argument('bag', metavar='BAG', help='the recorded bag')
-    parser.add_argument('--out', required=True, metavar='BAG', help='the bag to make, a new folder')
+    parser = make_parser()
+    return run(lambda args: replay(args, parser), parser, argv)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """What the command line may have."""
+    parser = argparse.ArgumentParser(prog='fluoro_shape_replay', description='Reconstruct backbone and tip from recorded bags (rosbag2: MCAP or sqlite3, compressed or not).')
+    parser.add_argument('bags', nargs='+', metavar='BAG', help='the recorded bag; of several each one by itself')
+    parser.add_argument('--out', required=True, metavar='BAG', help='the bag to make, a new folder; for several bags the folder for their results')
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument('--jobs', type=count, default=1, metavar='N', help='of several bags so many at a time (default: 1)')
+    workers.add_argument('--scheduler', metavar='ADDRESS', help='instead: HOST:PORT of a Dask scheduler, whose workers (dask worker --nthreads 1) see the same folders')
     parser.add_argument('--storage', choices=('mcap', 'sqlite3'), help='default: sqlite3 if the new bag ends in .db3, else mcap')
     parser.add_argument('--with-images', action='store_true', help='copy the images and camera infos too, logged at their stamps')
     parser.add_argument('--report', metavar='HTML', help='make a page to look at: what became of the pairs, the tip\'s track, overlays, the backbone in 3-D over time')
@@ -52,12 +65,13 @@ def main(argv=None) -> int:
     parser.add_argument('-p', '--param', action='append', default=[], metavar='NAME=VALUE', help='a parameter of fluoro_shape_node; may be repeated')
     parser.add_argument('--params', metavar='YAML', help='a ROS parameter file with the parameters of fluoro_shape')
     parser.add_argument('-r', '--remap', action='append', default=[], metavar='FROM:=TO',
-                        help=f'another name for a topic, read ({", ".join(INPUTS)}) or written ({", ".join(RESULTS)}); may be repeated')
+                        help=f'another name for a topic, read ({", ".join((*INPUTS, *TF))}) or written ({", ".join(RESULTS)}); may be repeated')
     parser.add_argument('--ros-args', action='store_true', help=argparse.SUPPRESS)     # so that -p and -r can be given as to the node
     for plane in PLANES:
         parser.add_argument(f'--image-{plane}', metavar='TOPIC', help=f'the same as -r plane_{plane}/image_raw:=TOPIC')
         parser.add_argument(f'--info-{plane}', metavar='TOPIC', help=f'the same as -r plane_{plane}/camera_info:=TOPIC')
-    return run(lambda args: _body(args, parser), parser, argv)
+    parser.add_argument('--json', metavar='FILE', help='write how many pairs came to what')
+    return parser
 
 
 def _seconds(text: str) -> float:
@@ -67,7 +81,8 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _body(args, parser: argparse.ArgumentParser) -> int:
+def replay(args, parser: argparse.ArgumentParser) -> int:
+    """What the arguments ask for; the exit code."""
     for module in ('rosbags.highlevel', 'mcap.stream_reader', 'yaml'):
         need(module, 'bags')
     if args.report:
@@ -79,21 +94,23 @@ def _body(args, parser: argparse.ArgumentParser) -> int:
         names = topic_names(args)
     except ValueError as error:
         parser.error(str(error))
-    if config.input.geometry == 'tf':
-        parser.error('geometry: a replay takes the poses from CameraInfo alone (camera_info), not from tf')
     suffix = '/compressed' if config.input.image_transport == 'compressed' else ''
-    topics = Topics({names[f'plane_{p}/image_raw'].removesuffix(suffix) + suffix: p for p in PLANES}, {names[f'plane_{p}/camera_info']: p for p in PLANES})
+    topics = Topics({names[f'plane_{p}/image_raw'].removesuffix(suffix) + suffix: p for p in PLANES}, {names[f'plane_{p}/camera_info']: p for p in PLANES},
+                    {names[name]: name for name in TF} if config.input.geometry == 'tf' else {})
     if len(topics.images) < 2 or len(topics.infos) < 2:
         parser.error('both planes have the same topic')
     if args.start + args.duration <= args.mask:
         parser.error('--mask: nothing is left to reconstruct before the end of --duration')
-    for path in filter(None, (args.report, args.csv, args.npz)):
+    if len(args.bags) > 1:
+        from .many import replay_all
+        return replay_all(args)
+    for path in filter(None, (args.report, args.csv, args.npz, args.json)):
         if Path(path).exists():
             raise ToolError(f'{path} exists already and is not overwritten')
         if not Path(path).parent.is_dir():
             raise ToolError(f'{path}: there is no folder {Path(path).parent}')
     try:
-        return _replay(args, config, topics, names)
+        return _replay(args, config, topics, names, parser)
     except BadBag as error:
         raise ToolError(str(error)) from error
 
@@ -102,7 +119,7 @@ def topic_names(args) -> dict[str, str]:
     """The absolute name of each topic of the node, as remapped. Raises ConfigError for what is no rule."""
     from msg_adapters.bags import absolute
 
-    names = {name: absolute(name) for name in (*INPUTS, *RESULTS)}
+    names = {name: absolute(name) for name in (*INPUTS, *TF, *RESULTS)}
     given = [(f'plane_{p}/{topic}', getattr(args, f'{what}_{p}')) for p in PLANES for what, topic in (('image', 'image_raw'), ('info', 'camera_info'))]
     for text in args.remap:
         name, rule, other = text.partition(':=')
@@ -119,13 +136,15 @@ def topic_names(args) -> dict[str, str]:
     return names
 
 
-def _replay(args, config: Config, topics: Topics, names: dict[str, str]) -> int:
+def _replay(args, config: Config, topics: Topics, names: dict[str, str], parser: argparse.ArgumentParser) -> int:
     """The work; the exit code. What was computed is kept when it is interrupted or something fails on the way."""
     from msg_adapters.bags import create_bag, open_bag
 
     failures, interrupted = [], False
-    with open_bag(args.bag) as bag:
+    with open_bag(args.bags[0]) as bag:
         check_topics(bag.types(), topics)
+        if topics.tf and not bag.types().keys() & topics.tf.keys():
+            parser.error(f'geometry: tf needs {" and ".join(topics.tf)}, of which none is in the bag; record them with the images')
         with create_bag(args.out, args.storage) as out:
             history = None
             sinks = [Results(out, names), *(kind(path) for kind, path in ((Table, args.csv), (Arrays, args.npz)) if path)]
@@ -143,10 +162,13 @@ def _replay(args, config: Config, topics: Topics, names: dict[str, str]) -> int:
         if history is not None:
             from .report import write_report
             with _kept(failures):
-                write_report(args.report, history, offline, args.bag)
+                write_report(args.report, history, offline, args.bags[0])
         damage = bag.damage
     summary = offline.summary
     print(report(summary, args.out))
+    if args.json:
+        with _kept(failures), writing(args.json), Path(args.json).open('x', encoding='utf-8') as file:
+            json.dump(as_json(summary), file)
     if summary.bug:
         failures.append(f'{summary.outcomes[Outcome.INTERNAL_ERROR.value]} pairs ended in an error of the program, the first: {summary.bug}')
     failures += filter(None, [damage])
@@ -180,6 +202,9 @@ def _kept(failures: list[str], then=lambda: None):
 
 def check_topics(types: dict[str, str], topics: Topics) -> None:
     """Raises ToolError where a topic is not in the bag, or is something else; it tells what could be meant."""
+    for topic in topics.tf:
+        if types.get(topic, TF_TYPE) != TF_TYPE:
+            raise ToolError(f'{topic} is a {types[topic]}; name another with -r {topics.tf[topic]}:=TOPIC')
     for named, fitting, what in ((topics.images, IMAGE_TYPES, 'image'), (topics.infos, ('sensor_msgs/msg/CameraInfo',), 'info')):
         known = ', '.join(sorted(t for t, kind in types.items() if kind in fitting)) or 'none'
         for topic, plane in named.items():
@@ -191,7 +216,7 @@ def check_topics(types: dict[str, str], topics: Topics) -> None:
 
 def copier(bag, out, topics: Topics):
     """A function that copies messages of `bag` into `out` as they are; declares their topics."""
-    for topic in (*topics.infos, *topics.images):
+    for topic in (*topics.infos, *topics.images, *(topic for topic in topics.tf if topic in bag.types())):
         out.declare(topic, bag.types()[topic])
     return lambda recorded, stamp: out.write_raw(recorded.topic, recorded.raw, stamp)
 
@@ -221,22 +246,6 @@ class Results:
 
     def close(self) -> None:
         """Nothing is left to do: the bag is closed by who made it."""
-
-
-def report(summary: Summary, out: str) -> str:
-    """The summary for people."""
-    c = summary.counts
-    lines = [f'{c.pairs} pairs of {summary.images["a"]} images of plane A and {summary.images["b"]} of plane B; results in {out}']
-    if summary.masked:
-        lines.append(f'{summary.masked:7d}  made the mask')
-    lines += [f'{n:7d}  {name}' for name, n in (*summary.outcomes.most_common(), *summary.warnings.most_common())]
-    lost = {'unpaired': c.unpaired, 'duplicate': c.duplicates, 'out of order': c.out_of_order, 'without a stamp': c.unstamped}
-    if any(lost.values()):
-        lines.append('images ' + ', '.join(f'{what}: {n}' for what, n in lost.items() if n))
-    if c.jumps:
-        lines.append(f'stamps jumped back: {c.jumps} times')
-    lines += [f'camera infos refused: {reason}' for _, reason in sorted(summary.refused.items())]
-    return '\n'.join(lines)
 
 
 if __name__ == '__main__':
