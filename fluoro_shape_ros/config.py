@@ -6,6 +6,12 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from .device import Device, DeviceError, load_device
+
+VISIBLE = 0.1           # m from the tip, which is what most images show of a device
+
 
 class ConfigError(ValueError):
     """A parameter value that can't work; the message names the parameter and the reason."""
@@ -39,8 +45,12 @@ class InputConfig:
 class DetectionConfig:
     """How the device is found in one image."""
 
+    image_kind: str = _p('xray', 'What the images are: X-ray images, or silhouettes, segmentations made upstream (0 is background, all else device; polarity does not count)',
+                         choices=('xray', 'silhouette'))
     polarity: str = _p('dark', 'The device against its surroundings', choices=('dark', 'bright', 'auto'))
-    robot_radius: float = _p(0.0006, 'Radius of the device; with the geometry it sets the filter scales', unit='m', low=1e-5, high=0.02)
+    device: str = _p('', 'What the device is made of, from tip to base: a YAML file, or one of braided, cannula, cannula3, coil, ep, rod, tendon, tube; empty: unknown. '
+                         f'It gives the radius, the median over {VISIBLE:g} m from the tip, and tells tip from base')
+    robot_radius: float = _p(0.0006, 'Radius of the device; with the geometry it sets the filter scales. Where device is given, its own counts', unit='m', low=1e-5, high=0.02)
     spacing_px: float = _p(10.0, 'Spacing of the control points along the device in the image (Burgner et al. 2011)', unit='px', low=1.0, high=200.0)
     min_length_px: float = _p(60.0, 'Connected curves shorter than this in an image are not the device', unit='px', low=2.0, high=10000.0)
 
@@ -77,6 +87,7 @@ class Config:
     detection: DetectionConfig = DetectionConfig()
     curve: CurveConfig = CurveConfig()
     plausibility: PlausibilityConfig = PlausibilityConfig()
+    described: Device | None = None     # what the file of `device` says
 
     @classmethod
     def from_values(cls, **values) -> Config:
@@ -92,22 +103,46 @@ class Config:
         if unknown:
             raise ConfigError(f'no such parameter: {", ".join(sorted(unknown))}')
         stages = {}
-        for stage in dataclasses.fields(self):
+        for stage in _stages():
             old = getattr(self, stage.name)
             new = {f.name: _checked(f, values[f.name]) for f in dataclasses.fields(old) if f.name in values}
             stages[stage.name] = dataclasses.replace(old, **new)
-        return Config(**stages)
+        return Config(**stages, described=_described(values['device']) if 'device' in values else self.described)
 
     def values(self) -> dict:
         """Parameter name to value, in the order of declaration."""
         return {f.name: getattr(getattr(self, stage.name), f.name)
-                for stage in dataclasses.fields(self) for f in dataclasses.fields(getattr(self, stage.name))}
+                for stage in _stages() for f in dataclasses.fields(getattr(self, stage.name))}
+
+    @property
+    def radius(self) -> float:
+        """m, of what is looked for: robot_radius, or that of the device which is described."""
+        return self.detection.robot_radius if self.described is None else visible_radius(self.described)
 
 
 def fields() -> list[dataclasses.Field]:
     """Every parameter as a dataclass field; `metadata` has description, unit, low, high, choices and element."""
     default = Config()
-    return [f for stage in dataclasses.fields(default) for f in dataclasses.fields(getattr(default, stage.name))]
+    return [f for stage in _stages() for f in dataclasses.fields(getattr(default, stage.name))]
+
+
+def _stages() -> list[dataclasses.Field]:
+    return [f for f in dataclasses.fields(Config) if f.name != 'described']
+
+
+def _described(name: str) -> Device | None:
+    """The device of a file or preset; None for no name. Raises ConfigError."""
+    try:
+        return load_device(name) if name else None
+    except DeviceError as error:
+        raise ConfigError(f'device: {error}') from error
+
+
+def visible_radius(device: Device) -> float:
+    """m: the median along what images show of a device's shaft."""
+    shaft = sorted(Device(device.segments).pieces(min(VISIBLE, device.length)), key=lambda piece: piece.radius)
+    total = np.cumsum([piece.stop - piece.start for piece in shaft])
+    return shaft[int(np.searchsorted(total, total[-1] / 2))].radius
 
 
 def constraint(f: dataclasses.Field) -> str:

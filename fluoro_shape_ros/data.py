@@ -75,6 +75,7 @@ class Prior:
     masks: tuple[np.ndarray, np.ndarray] | None = None  # (H, W) float32, device-free mean image of each plane
     predicted: np.ndarray | None = None     # (N, 3) a kinematic model's guess, base to tip, m
     prediction_fault: str = ''              # why the newest guess can't be used; empty where it can, or where there is none
+    search: object | None = None            # a method.search.Search of an earlier pair that was cut short, to go on with
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,8 @@ class Reconstruction:
     stage_seconds: dict[str, float] = field(default_factory=dict)   # wall time of each stage
     prediction: str = ''                                # agrees, not compared, or ignored and why; empty: there was none
     confidence: float = float('nan')                    # probability that the shape is right; of a rejected pair that of the best curve tried; NaN: none was, or not known
+
+    search: object | None = None                        # a method.search.Search that was cut short
 
     def __post_init__(self):
         if (self.outcome is Outcome.OK) != (self.shape is not None):

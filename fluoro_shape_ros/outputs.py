@@ -63,6 +63,6 @@ class Outputs:
 def _markers(job: Job, frame: Frame | None, result: Reconstruction) -> MarkerArray:
     text = '\n'.join(words(result))
     if result.shape is not None:
-        return shape_to_markers(result.shape, job.config.detection.robot_radius, text, job.stamp_ns, job.frame_id, ros_message)
+        return shape_to_markers(result.shape, job.config.radius, text, job.stamp_ns, job.frame_id, ros_message)
     place = isocenter(frame.views) if frame else None   # where a biplane system looks
     return rejection_to_markers(text, place, job.stamp_ns, job.frame_id, ros_message)

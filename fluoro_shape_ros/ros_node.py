@@ -25,7 +25,7 @@ from msg_adapters.messages import ros_message, stamp_ns
 from msg_adapters.shapes import BadPath, path_to_points
 
 from . import params
-from .config import ConfigError
+from .config import Config, ConfigError
 from .data import Frame, Outcome, Reconstruction
 from .limits import bounded
 from .outputs import Outputs
@@ -208,7 +208,13 @@ class FluoroShapeNode(Node):
         return SetParametersResult(successful=True)
 
     def _on_parameters(self, parameters) -> None:
-        old, self._config = self._config, params.changed(self._config, parameters)
+        try:
+            old, self._config = self._config, params.changed(self._config, parameters)
+        except ConfigError as error:    # the device's file is another one than when it was checked
+            self.get_logger().error(str(error))
+            return
+        if any(p.name in ('device', 'robot_radius') for p in parameters):
+            self.get_logger().info(_radius(self._config))
         self._pairer.slop_ns = self._slop_ns
         subscribed = ('geometry', 'image_transport', 'image_reliability')
         if any(getattr(old.input, name) != getattr(self._config.input, name) for name in subscribed):
@@ -310,7 +316,7 @@ class FluoroShapeNode(Node):
         images, infos = (' and '.join(named(f'plane_{plane}/{topic}') + more for plane in PLANES) for topic, more in (('image_raw', suffix), ('camera_info', '')))
         frame = f'frame "{given.input.reference_frame}"' if given.input.reference_frame else 'the frame of plane A\'s camera info'
         self.get_logger().info(f'images on {images}, cameras on {infos} (geometry {given.input.geometry}); results on {named("backbone")} and '
-                               f'{named("tip")} in {frame}; method {given.curve.method}, robot_radius {1e3 * given.detection.robot_radius:g} mm')
+                               f'{named("tip")} in {frame}; method {given.curve.method}, {_radius(given)}')
 
     def _warn(self) -> None:
         """A line in the log now and then, while no results come or another node has the same name."""
@@ -325,6 +331,11 @@ class FluoroShapeNode(Node):
             self._trouble = kind, now
         if words and now > self._trouble[1] + PERSISTENT_S:
             self.get_logger().warn(f'no results: {words}', throttle_duration_sec=WARN_S)
+
+
+def _radius(config: Config) -> str:
+    """What is looked for, and who says so."""
+    return f'robot_radius {1e3 * config.radius:g} mm' + (f', that of device {config.detection.device}' if config.described else '')
 
 
 def _key(statuses) -> list:

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
+from fluoro_shape_ros.device import load_device
 from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.data import Frame
 from fluoro_shape_ros.imaging.field import field_of_view
@@ -227,3 +228,13 @@ def test_nothing_is_fitted_from_a_start_that_no_device_can_have(frame, truth, st
     else:
         points = np.tile(np.concatenate([truth, truth[::-1]]), (20, 1))
     assert fitted(frame, points) is None
+
+
+@pytest.mark.parametrize('kind', ['ep', 'coil', 'braided'])
+def test_a_start_anywhere_gives_no_fit_or_a_finite_one(kind):
+    """Far from the device, across it, and much too short."""
+    scene = xray_run(0, views=VIEWS, lengths=(0.06, 0.07), anatomy=False, device=load_device(kind)).scene()
+    middle_of = scene.truth[len(scene.truth) // 2]
+    for points in (scene.truth[::-1][:20], middle_of + np.linspace(-0.03, 0.03, 60)[:, None] * [0.3, 0.9, 0.1], scene.truth + 0.004, scene.truth[30:60]):
+        f = fitted(scene.frame, points)
+        assert f is None or np.isfinite([f.start, f.stop, *f.end_sigma, *f.farther]).all()

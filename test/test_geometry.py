@@ -152,13 +152,19 @@ def test_a_stereo_pair_looks_to_where_its_images_are_a_quarter_apart_whatever_th
 
 
 def test_a_source_where_the_planes_look_is_named():
-    """The device would be as wide as the image, and filters without end be made for it: 1000 px a radian, 81 px high, radius 20.25 mm at 1 m."""
-    check_scale((A, B), 0.0202)
-    with pytest.raises(GeometryError, match='plane a: a device of radius 20.3 mm would be 40.6 px wide'):
-        check_scale((A, B), 0.0203)
+    """The device would be a quarter as wide as the image, and filters without end be made for it: 1000 px a radian, 81 px high, radius 10.125 mm at 1 m."""
+    check_scale((A, B), 0.0101)
+    with pytest.raises(GeometryError, match='plane a: a device of radius 10.2 mm would be 20.4 px wide'):
+        check_scale((A, B), 0.0102)
     here = make_view('b', K @ np.array([[0, 0, -1.0, 0], [0, 1, 0, 0], [1, 0, 0, 0]]), 101, 81)
     with pytest.raises(GeometryError, match='plane b: .* px wide'):
         check_scale((A, here), 0.0006)
+
+
+def test_a_device_less_than_a_tenth_of_a_pixel_wide_asks_for_metres():
+    check_scale((A, B), 0.000051)
+    with pytest.raises(GeometryError, match='is P in metres'):
+        check_scale((A, B), 0.000049)
 
 
 @pytest.mark.parametrize('model, D', [('plumb_bob', [-0.2, 0.05, 1e-3, -2e-3, 0.01]), ('rational_polynomial', [0.3, 0.1, 0, 0, 0.02, 0.1, 0.05, 0.01]),

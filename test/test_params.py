@@ -53,7 +53,9 @@ def test_defaults_are_those_of_the_config(make):
     ('base_position', None, ()),                        # what `-p base_position:=[]` arrives as
     ('threads', 0, 0),
     ('reference_frame', 'cell', 'cell'),
+    ('device', 'ep', 'ep'),
     ('tracking', False, False),
+    ('image_kind', 'silhouette', 'silhouette'),
 ])
 def test_overrides_are_taken(make, name, given, taken):
     node = make(**{name: given})
@@ -68,11 +70,13 @@ def test_overrides_are_taken(make, name, given, taken):
     ('robot_radius', 'thin', 'robot_radius: needs a finite number'),
     ('base_position', [0.0, 1.0], 'base_position: needs 0 or 3 numbers, got 2'),
     ('polarity', 'grey', 'polarity: must be one of dark, bright, auto'),
+    ('image_kind', 'mri', "image_kind: must be one of xray, silhouette, got 'mri'"),
     ('threads', 2.0, 'threads: needs a int'),
     ('tracking', 1, 'tracking: needs a bool'),
     ('tracking', 'true', 'tracking: needs a bool'),     # as a quoted one comes
     ('base_position', 5, 'base_position: needs a list of numbers, got 5'),
     ('time_budget', -1.0, 'time_budget: must lie in [0, 60] s'),
+    ('device', '/none.yaml', 'device: /none.yaml: no such file'),
     ('qos_overrides./backbone.publisher.depth', 'abc', 'depth: needs a whole number from 0'),
     ('qos_overrides./backbone.publisher.depth', -3, 'depth: needs a whole number from 0'),
     ('qos_overrides./plane_a/image_raw.subscription.depth', True, 'depth: needs a whole number from 0'),
@@ -126,6 +130,8 @@ def test_a_change_keeps_everything_else():
 def test_a_change_that_cannot_work_raises():
     with pytest.raises(ConfigError, match='expected_length: needs 0 <= min < max'):
         params.changed(Config(), [Parameter('expected_length', value=[0.2, 0.1])])
+    with pytest.raises(ConfigError, match='device: none: no such file'):
+        params.changed(Config(), [Parameter('device', value='none')])
 
 
 @pytest.mark.parametrize('given, taken', [

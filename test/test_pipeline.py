@@ -136,6 +136,22 @@ def test_depth_and_range_of_the_image_do_not_matter(scene, config, answer, chang
     assert_same(reconstruct(mapped(scene.frame, change), config), answer)
 
 
+def shown(image, display):
+    """The same X-rays on another display, 16 bits."""
+    share = image / image.max()
+    return np.round({'gamma 0.5': share**0.5, 'gamma 2': share**2, 'logarithm': np.log1p(200 * share) / np.log(201)}[display] * 65535).astype(np.uint16)
+
+
+@pytest.mark.parametrize('planes', [(0,), (1,), (0, 1)])
+@pytest.mark.parametrize('display', ['gamma 0.5', 'gamma 2', 'logarithm'])
+def test_what_a_display_does_to_the_counts_does_not_matter(scene, config, answer, display, planes):
+    frame = replace(scene.frame, images=tuple(shown(i, display) if k in planes else i for k, i in enumerate(scene.frame.images)))
+    other = reconstruct(frame, config)
+    assert_allclose(other.confidence, answer.confidence, atol=0.01)
+    assert_allclose(other.shape.points[[0, -1]], answer.shape.points[[0, -1]], atol=NOISE)     # how opaque an end looks is not freed of the display yet
+    assert cKDTree(answer.shape.points).query(other.shape.points[1:-1])[0].max() < 0.03e-3       # 0.1 px
+
+
 def test_a_float_image_may_be_negative(scene, config, answer):
     shifted = mapped(scene.frame, lambda i: i.astype(np.float32) - 300)
     assert_same(reconstruct(shifted, config), answer, within=0.05e-3, ends=0.7e-3)   # without a true zero the darkness of the device is not known
@@ -361,6 +377,16 @@ def test_what_was_found_by_then_is_judged(scene, config, answer):
     assert result.outcome is Outcome.OUT_OF_TIME and 'by then: ' in result.detail and 0.5 < result.confidence < 1 and None not in result.centerlines
     assert_same(reconstruct(scene.frame, config.replace(min_confidence=0.5), prior, PAST), answer)
     assert reconstruct(scene.frame, config.replace(expected_length=(0.1, 0.2)), prior, PAST).outcome is Outcome.LENGTH      # no more time would have helped
+
+
+def test_a_search_that_is_cut_short_goes_on_with_the_next_pair(scene, config, answer):
+    prior, turns = Prior(), 0
+    while not (result := reconstruct(scene.frame, config, prior, until=0.0)).shape:
+        assert result.outcome is Outcome.OUT_OF_TIME and result.search is not None
+        prior, turns = Prior(search=result.search), turns + 1
+        assert turns < 50
+    assert turns >= 2 and result.search is None
+    assert cKDTree(answer.shape.points).query(result.shape.points)[0].max() < SAME
 
 
 def test_the_device_is_looked_for_where_it_was_however_late_it_is(scene, config, answer):

@@ -88,6 +88,18 @@ def test_a_part_of_the_bag(run, tmp_path):
     assert list(outcomes(tmp_path / 'first')) == [5 * SECOND]
 
 
+@pytest.mark.parametrize('full', [1, 255])
+@pytest.mark.parametrize('compressed', [False, True])
+def test_silhouettes(tmp_path, full, compressed):
+    masks = [((pixels < 140) * full).astype(np.uint8) for pixels in GOOD]
+    record(tmp_path / 'run', [masks, [0 * m for m in masks]], compressed=compressed)
+    topics = [word for p in 'ab' for word in (f'--image-{p}', f'plane_{p}/image_raw/compressed')] if compressed else []
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', BASE, '-p', 'image_kind=silhouette', *topics) == 0
+    assert outcomes(tmp_path / 'out') == {5 * SECOND: 'ok', 5_100_000_000: 'no_device_in_plane_a'}
+    points = path_to_points(read(tmp_path / 'out')['/backbone'][0][1])
+    assert cKDTree(curve()).query(points)[0].max() < TOLERANCE and np.linalg.norm(points[-1] - curve()[-1]) < TOLERANCE
+
+
 def cluttered(pair):
     """The pair in front of another, longer wire, which takes half of the beam."""
     lines = [np.array([[20, 40], [300, 290]]), np.array([[20, 290], [300, 50]])]
@@ -165,7 +177,7 @@ def test_what_is_left_of_a_damaged_bag_is_replayed(tmp_path, capsys):
     assert (tmp_path / 'out.csv').exists()
 
 
-def test_ctrl_c_keeps_what_was_computed(run, tmp_path, monkeypatch):
+def test_ctrl_c_keeps_what_was_computed(run, tmp_path, monkeypatch, capsys):
     def interrupted(frame, config, prior):
         if frame.stamp_ns == 5_200_000_000:
             raise KeyboardInterrupt
@@ -175,6 +187,7 @@ def test_ctrl_c_keeps_what_was_computed(run, tmp_path, monkeypatch):
     assert main(run, '--out', tmp_path / 'out', '--npz', tmp_path / 'out.npz') == 130
     assert list(outcomes(tmp_path / 'out').values()) == ['ok', 'no_device_in_plane_a']
     assert list(np.load(tmp_path / 'out.npz')['outcome']) == ['ok', 'no_device_in_plane_a']
+    assert '2 pairs of 3 images of plane A' in capsys.readouterr().out       # the third was read, but not answered
 
 
 def test_tables_for_other_programs(run, tmp_path):
@@ -247,6 +260,17 @@ def test_a_bad_image_is_named_and_the_next_pair_works(tmp_path):
     assert 'plane a' in status.message and 'bayer_rggb8' in status.message and status.level == 2
 
 
+def test_frames_that_contradict_are_said(tmp_path, capsys):
+    """Images of plane A with the camera info of another frame."""
+    def spoil(message):
+        message.header.frame_id = message.header.frame_id.replace('plane_a', 'plane_b')
+    record(tmp_path / 'run', [GOOD], spoil=spoil)
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == 'plane A: its images are of frame "plane_b_optical", its camera info of "plane_a_optical": are the calibrations exchanged?'
+    assert not any('plane B' in line for line in lines[1:])
+
+
 def test_no_camera_info(tmp_path):
     record(tmp_path / 'run', [GOOD], infos=False)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
@@ -313,6 +337,15 @@ def test_a_bad_parameter_file_is_named(tmp_path, text, says):
         read_parameters(str(tmp_path / 'params.yaml'))
 
 
+def test_a_device_gives_the_radius(run, tmp_path):
+    path = tmp_path / 'rod.yaml'
+    path.write_text('segments: [{length: rest, radius: 0.001, material: metal}]')
+    assert main(run, '--out', tmp_path / 'out') == 0
+    assert main(run, '--out', tmp_path / 'described', '-p', f'device={path}', '-p', 'robot_radius=0.0003') == 0
+    tips, described = ([(m.point.x, m.point.y, m.point.z) for _, m in read(tmp_path / out)['/tip']] for out in ('out', 'described'))
+    assert tips == described and len(tips) == 2
+
+
 def process(*arguments, code=None):
     start = ['-m', 'fluoro_shape_ros.tools.replay'] if code is None else ['-c', code]
     return subprocess.run([sys.executable, *start, '-p', RADIUS, *map(str, arguments)], capture_output=True, text=True, timeout=120)
@@ -335,6 +368,8 @@ def test_as_a_process(run, tmp_path):
     (['run', '--out', '.'], 1, '. exists already'),
     (['run', '-p', 'robot_radius=-1'], 2, 'robot_radius: must lie in'),
     (['run', '-p', 'colour=red'], 2, 'no such parameter: colour'),
+    (['run', '-p', 'image_kind=mri'], 2, 'image_kind: must be one of xray, silhouette'),
+    (['run', '-p', 'device=none.yaml'], 2, 'device: none.yaml: no such file'),
     (['run', '-p', 'robot_radius'], 2, 'needs the form name=value'),
     (['run', '-p', 'geometry=tf'], 2, 'geometry: '),
     (['run', '--image-a', 'x', '--image-b', '/x'], 2, 'same topic'),

@@ -22,7 +22,7 @@ from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.method.prediction import look
 from fluoro_shape_ros.method.propose.lines import Hypothesis
 from fluoro_shape_ros.method.features import MEAN, TIP
-from fluoro_shape_ros.method.search import RESTLESS_PX, Attempt, at_rest, choose, exclusive, tries
+from fluoro_shape_ros.method.search import RESTLESS_PX, Attempt, Search, at_rest, choose, exclusive
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 
@@ -50,6 +50,10 @@ def is_right(f, truth):
     return mean_off(f, truth) < RIGHT and cKDTree(f.curve(2)).query(truth[[0, -1]])[0].max() < RIGHT_END
 
 
+def never_late():
+    return False
+
+
 def sized_up(sheet):
     def judged(f):
         seen = features(f, sheet, RADIUS, True)
@@ -57,9 +61,11 @@ def sized_up(sheet):
     return judged
 
 
-def searched(sheet, guess=None, leads=(), **other):
-    given = dict(judge=sized_up(sheet), settles=lambda odds: judge.load().settles(odds, LEAST)) | other
-    return tries(sheet, RADIUS, MIN_LENGTH, guess=guess, leads=leads, **given)
+def searched(sheet, guess=None, leads=(), late=never_late, **other):
+    """What was tried, and the lines."""
+    found = Search(sheet, RADIUS, MIN_LENGTH, **dict(judge=sized_up(sheet), settles=lambda odds: judge.load().settles(odds, LEAST)) | other, guess=guess, leads=leads)
+    found.go_on(late)
+    return found.tried, found.lines
 
 
 def never(odds):
@@ -231,6 +237,26 @@ def test_what_settles_it_is_compared_with_the_other_way_round_however_late_it_is
     fitted, _ = counted(monkeypatch, [Hypothesis(scene.truth, same), Hypothesis(scene.truth[::-1], same)])
     tried, _ = searched(sheet, settles=always, late=late_from(3)[0])
     assert len(tried) == len(fitted) == 2
+
+
+def test_a_search_goes_on_where_it_was_interrupted(sheet):
+    def search_of():
+        return Search(sheet, RADIUS, MIN_LENGTH, sized_up(sheet), never)
+    whole, parts, turns = search_of(), search_of(), 0
+    whole.go_on()
+    while not parts.finished:
+        parts.go_on(lambda: True)
+        turns += 1
+    assert whole.finished and turns > len(whole.tried) >= 2
+    assert [t.log_odds for t in parts.tried] == [t.log_odds for t in whole.tried]
+    parts.go_on()       # nothing is left
+    assert len(parts.tried) == len(whole.tried)
+
+
+def test_what_one_pair_shows_is_found_in_the_next(scene, sheet):
+    found = Search(sheet, RADIUS, MIN_LENGTH, sized_up(sheet), lambda odds: judge.load().settles(odds, LEAST))
+    found.go_on()
+    assert is_right(found.likeliest(RADIUS, sheet)[0], scene.truth)
 
 
 def test_lines_of_one_plane_are_not_looked_for_in_the_other_when_time_is_up(scene, sheet, monkeypatch):

@@ -20,7 +20,7 @@ from ..imaging.mask import subtract
 from ..imaging.prepare import sheet_of
 from ..method.features import MEAN, MEAN_PX, NAMES, TIP, TIP_PX, at_first_sight, features
 from ..method.judge import Judge, load, worse
-from ..method.search import exclusive, tries
+from ..method.search import Search, exclusive
 from ..method.tip import tip_of
 from ..metrics import compare
 from .families import Sources, families, varied
@@ -78,8 +78,10 @@ def gather(task: Task) -> Curves:
         seen, last = features(f, sheet, scene.radius, order(f)), order(f)
         return seen, float(model.log_odds(seen)), last
 
-    tried, _ = tries(sheet, scene.radius, config.detection.min_length_px, sized_up, lambda odds: False,
-                     first_sight=lambda points: float(model.log_odds(at_first_sight(points, sheet, scene.radius))))
+    search = Search(sheet, scene.radius, config.detection.min_length_px, sized_up, lambda odds: False,
+                    first_sight=lambda points: float(model.log_odds(at_first_sight(points, sheet, scene.radius))))
+    search.go_on()
+    tried = search.tried
     px = np.mean([1 / pixels_per_metre(v.P, scene.truth if device else isocenter(frame.views)[None]) for v in frame.views])
     right = [device and is_right(t.fit.curve(200)[::1 if t.tip_is_last else -1], scene.truth, px) for t in tried]
     clash = np.zeros((len(tried), len(tried)), bool)

@@ -149,13 +149,14 @@ def isocenter(views: tuple[View, View]) -> np.ndarray:
 
 
 def check_scale(views: tuple[View, View], radius: float) -> None:
-    """Raises GeometryError where a device of `radius` (m) would be half as wide as an image, or wider, at the `isocenter`: no C-arm stands so near."""
+    """Raises GeometryError where a device of `radius` (m) would be a quarter as wide as an image, or wider, at the `isocenter`, or less than a tenth of a
+    pixel: no C-arm is made so; P may not be in metres."""
     center = isocenter(views)[None]
     for v in views:
         with np.errstate(divide='ignore'):
             half_width_px = radius * pixels_per_metre(v.P, center)
-        if not half_width_px < min(v.width, v.height) / 4:
-            raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be {2 * half_width_px:.3g} px wide where the planes look')
+        if not 0.05 <= half_width_px < min(v.width, v.height) / 8:
+            raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be {2 * half_width_px:.3g} px wide where the planes look: is P in metres?')
 
 
 def fundamental(Pa: np.ndarray, Pb: np.ndarray) -> np.ndarray:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..geometry.cameras import crop, distort, project
+from ..geometry.cameras import crop, distort, isocenter, pixels_per_metre, project
+from .parallel import both
+from .silhouette import outline, shadow
 from .strips import Sheet
 
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next
@@ -40,6 +42,14 @@ def sheet_of(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Sh
     """Both planes' images, or a region of each, as the method wants them."""
     parts = [crop(v, *r) for v, r in zip(views, regions)] if regions != (WHOLE, WHOLE) else views
     return Sheet.of(list(zip(images, regions)), [f[r] for f, r in zip(fields, regions)], parts, lambda i, out: stable_noise(i[0], polarity, i[1], out))
+
+
+def silhouettes(images, views, radius: float) -> tuple[tuple, list[np.ndarray], Sheet]:
+    """Silhouettes of a device of `radius` m as X-ray images of a dark device and their fields, which are all of them; and a sheet of the outlines as they are."""
+    widths = [radius * pixels_per_metre(v.P, isocenter(views)[None]) for v in views]
+    fields, pixels = [np.full(image.shape, 255, np.uint8) for image in images], sum(image.size for image in images)
+    found = both(outline, images, widths, pixels=pixels)
+    return both(shadow, found, widths, pixels=pixels), fields, Sheet.of(found, fields, views)
 
 
 def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:

@@ -228,7 +228,7 @@ def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int) -
     spread = np.empty(len(shadows))
     for v, (profiles, shape) in enumerate(zip(strips.profiles, shadows)):
         centred = shape - shape.mean()
-        dark = cv2.blur(darkness_across(profiles, shape), (1, along))[along // 2::along] / (centred @ centred)
+        dark = cv2.blur(darkness_across(profiles, shape), (1, along))[min(along // 2, len(profiles) - 1)::along] / (centred @ centred)
         x, half = strips.offsets_px, len(shape) // 2
         beside = dark[:, (np.abs(x) > beside_px) & (np.abs(x) < x[-1] - half)]
         spread[v] = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12

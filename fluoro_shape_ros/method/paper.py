@@ -148,4 +148,4 @@ def reconstruct_curves(views, centerlines_px: tuple[np.ndarray, np.ndarray], spa
 def half_width_px(views, config: Config) -> list[float]:
     """The device's half width in each image, at the isocentre."""
     center = isocenter(views)[None]
-    return [config.detection.robot_radius * pixels_per_metre(v.P, center) for v in views]
+    return [config.radius * pixels_per_metre(v.P, center) for v in views]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -16,19 +16,22 @@ from ..geometry.curve import arc_length, distance_to, resample
 from ..imaging.field import border_distance, field_of_view
 from ..imaging.mask import subtract
 from ..imaging.parallel import both
-from ..imaging.prepare import dark_device, sheet_of
+from ..imaging.prepare import dark_device, sheet_of, silhouettes
 from ..imaging.strips import Sheet
 from . import judge, paper
 from .backbone import backbone
 from .checks import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .features import MEAN, MEAN_PX, TIP, TIP_PX, at_first_sight, features
 from .fit.fit import Fit, fit
+from .known_device import ALIKE, CONTRADICTS, Likeness, likeness, verdict
 from .near import Near, predicted, tracked
+from .outline import on_outlines
 from .prediction import Guess, borne_out, informed, judged, look
-from .search import Attempt, choose, projected, tries
+from .search import Attempt, Search, choose, projected
 from .tip import tip_of
 
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
+CURVE = 400             # points of a fit, that its darkness is looked at along
 OPEN = {Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B, Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE}     # what a longer search might have answered
 
 
@@ -39,64 +42,89 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: flo
     """
     clock = _Stopwatch(until)
     try:
-        check(frame.views, config.detection.robot_radius)
+        check(frame.views, config.radius)
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
-    images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
-    fields = both(field_of_view, frame.images, pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
-    clock.lap('prepare')
     by = _by_paper if config.curve.method == 'paper' else _by_spline
+    if config.detection.image_kind == 'silhouette':
+        images, fields, outlines = silhouettes(frame.images, frame.views, config.radius)
+        config = config.replace(polarity='dark')
+        by = by if by is _by_paper else partial(by, measured=partial(on_outlines, outlines, radius=config.radius))
+    else:
+        images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
+        fields = both(field_of_view, frame.images, pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
+    clock.lap('prepare')
     guess, why = look(prior, frame.views, config.curve.prior_sigma)
     return judged(_in_time(by(frame, images, fields, config, prior, guess, clock), clock), guess, why)
 
 
-def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
-    """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images."""
-    radius, polarity, least = config.detection.robot_radius, config.detection.polarity, config.plausibility.min_confidence
+def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch, measured=lambda f: f) -> Reconstruction:
+    """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images.
+
+    measured: what is made of a Fit before it is judged.
+    """
+    radius, polarity, least = config.radius, config.detection.polarity, config.plausibility.min_confidence
     enough = max(least, judge.BEYOND_DOUBT)
     tip = partial(_tip, frame, fields, config, prior, guess)
     model = judge.load()
 
     def sized_up(sheet: Sheet, f: Fit) -> tuple[np.ndarray, float, bool]:
-        """Features of a fit and its log odds, for which a prediction that it bears out speaks; and whether its last end is the tip."""
-        last, _ = tip(f)
+        """Features of a fit and its log odds, with what a prediction that it bears out and the device's description say; and whether its last end is the tip."""
+        alike = _alike(f.curve(CURVE), sheet, config)
+        last, _ = tip(f, alike)
         seen = features(f, sheet, radius, last)
-        return seen, float(model.log_odds(seen)) + (judge.PREDICTED if guess is not None and borne_out(f.curve(100), guess) else 0.0), last
+        predicted = judge.PREDICTED if guess is not None and borne_out(f.curve(100), guess) else 0.0
+        return seen, float(model.log_odds(seen)) + predicted + verdict(config.described, alike, f, last)[0], last
 
-    leads, chosen, lines = [], None, ()
+    leads, chosen, lines, unfinished = [], None, (), None
     for n in _near(frame, images, fields, config, prior, guess, clock):
-        attempt = Attempt(n.fit, (None, None), *sized_up(n.sheet, n.fit))
-        if n.alone and model.settles(attempt.log_odds, enough) and (guess is None or borne_out(n.fit.curve(100), guess)):
-            chosen, p = attempt, judge.probability(attempt.log_odds)
+        f = measured(n.fit)
+        attempt = Attempt(f, (None, None), *sized_up(n.sheet, f))
+        if n.alone and model.settles(attempt.log_odds, enough) and (guess is None or borne_out(f.curve(100), guess)):
+            chosen, p, sheet = attempt, judge.probability(attempt.log_odds), n.sheet
             break
-        leads.append(n.fit)
+        leads.append(f)
     if chosen is None:
         sheet = sheet_of(images, fields, frame.views, polarity)
-        tried, lines = tries(sheet, radius, config.detection.min_length_px, partial(sized_up, sheet), lambda odds: model.settles(odds, enough),
-                             guess, leads, clock.late, lambda points: float(model.log_odds(at_first_sight(points, sheet, radius))))
+        sized = partial(sized_up, sheet)
+        if prior.search is None or guess is not None:
+            search = Search(sheet, radius, config.detection.min_length_px, sized, lambda odds: model.settles(odds, enough), guess, leads,
+                            lambda points: float(model.log_odds(at_first_sight(points, sheet, radius))), measured)
+            search.go_on(clock.late)
+            tried = search.tried
+        else:       # one that an earlier pair had no time for; what it finds there is looked for here
+            search = prior.search
+            search.go_on(clock.late)
+            leads += map(measured, search.likeliest(radius, sheet) if search.finished else [])
+            tried = [Attempt(f, (None, None), *sized(f)) for f in leads]
+        lines, unfinished = search.lines, None if search.finished else search
         clock.lap('search')
         if not tried:
-            return _nothing(lines, config, clock)
+            return replace(_nothing(lines, config, clock), search=unfinished)
         chosen, p = choose(tried)
 
     f, confidence = chosen.fit, model.confidence(p)
     if confidence < min(least, 0.5) and any(line is None for line in lines):     # rather wrong than right
-        return replace(_nothing(lines, config, clock), confidence=confidence)
+        return replace(_nothing(lines, config, clock), confidence=confidence, search=unfinished)
     seen = tuple(Centerline(projected(f, v) if c is None else c.points_px) for v, c in zip(frame.views, chosen.lines))
-    last, guessed = tip(f)
+    alike = _alike(f.curve(CURVE), sheet, config)
+    last, guessed = tip(f, alike)
+    against, words = verdict(config.described, alike, f, last, config.detection.device)
+    if against > min(CONTRADICTS, model.terms(chosen.features).min()):
+        words = model.why(chosen.features, chosen.log_odds, p)
     if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)
     shape = backbone(f, frame.views, last, config.curve.backbone_spacing)
     clock.lap('backbone')
-    doubt = (Outcome.LOW_CONFIDENCE, model.why(chosen.features, chosen.log_odds, p)) if confidence < least else _doubt(shape, config, frame)
+    doubt = (Outcome.LOW_CONFIDENCE, words) if confidence < least else _doubt(shape, config, frame)
     if doubt:
-        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence)
+        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence, search=unfinished)
     return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence)
 
 
 def _near(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Iterator[Near]:
     """The device where it was, or should be by now, then where a prediction has it."""
-    here = frame, images, fields, config.detection.polarity, config.detection.robot_radius
+    here = frame, images, fields, config.detection.polarity, config.radius
     if config.curve.tracking and prior.previous is not None:
         found = tracked(*here, prior)
         clock.lap('track')
@@ -144,7 +172,9 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
 
     best = max(curves, key=lambda c: arc_length(c)[-1])
     metres_per_px = 1 / np.mean([pixels_per_metre(v.P, best) for v in frame.views])
-    forward, guessed = tip_of(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, _known_order(best, prior, guess))
+    sheet = sheet_of(images, fields, frame.views, 'dark')
+    forward, guessed = tip_of(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, _known_order(best, prior, guess),
+                              _alike(best, sheet, config))
     points, s = resample(best if forward else best[::-1], config.curve.backbone_spacing)
     residuals = residuals_px(points, frame.views, seen)
     clock.lap('curve')
@@ -152,7 +182,7 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
     doubt = (check_curvature(curves, curvature_limit(config, metres_per_px)) or check_length(s[-1], config)
              or check_reprojection(residuals, config))
     clock.lap('plausibility')
-    confidence = _confidence_of(points, sheet_of(images, fields, frame.views, 'dark'), config)
+    confidence = _confidence_of(points, sheet, config)
     if doubt:
         return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence)
     shape = Shape(points, s, np.full((len(points), 3, 3), np.nan), residuals)   # the published method knows no covariance
@@ -161,7 +191,7 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
 
 def _confidence_of(points: np.ndarray, sheet: Sheet, config: Config) -> float:
     """The probability that a backbone (N, 3) of dark devices is right, which a fit did not make: that of the fit which begins there, if they are one curve."""
-    f = fit(sheet, points, config.detection.robot_radius, 1)
+    f = fit(sheet, points, config.radius, 1)
     if f is None:
         return 0.0
     model, ends = judge.load(), f.curve(2)
@@ -169,7 +199,7 @@ def _confidence_of(points: np.ndarray, sheet: Sheet, config: Config) -> float:
     px = f.s[1] - f.s[0]
     if distance_to(points, f.curve(400)).mean() > max(MEAN, MEAN_PX * px) or np.linalg.norm(ends[int(last)] - points[-1]) > max(TIP, TIP_PX * px):
         return 0.0
-    return model.confidence(judge.probability(float(model.log_odds(features(f, sheet, config.detection.robot_radius, last)))))
+    return model.confidence(judge.probability(float(model.log_odds(features(f, sheet, config.radius, last)))))
 
 
 def _doubt(shape: Shape, config: Config, frame: Frame) -> tuple[Outcome, str] | None:
@@ -179,9 +209,16 @@ def _doubt(shape: Shape, config: Config, frame: Frame) -> tuple[Outcome, str] | 
             or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
 
 
-def _tip(frame: Frame, fields, config: Config, prior: Prior, guess: Guess | None, f: Fit) -> tuple[bool, bool]:
+def _tip(frame: Frame, fields, config: Config, prior: Prior, guess: Guess | None, f: Fit, alike: Callable[[], Likeness]) -> tuple[bool, bool]:
     """Whether the last end of a fit is the tip, and whether that is a guess."""
-    return tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config, _known_order(f.curve(100), prior, guess))
+    return tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config, _known_order(f.curve(100), prior, guess), alike)
+
+
+def _alike(points: np.ndarray, sheet: Sheet, config: Config) -> Callable[[], Likeness]:
+    """What the device's description says of the (N, 3) points of a curve, worked out once it is asked for; silhouettes tell nothing, they are equally dark all along."""
+    if config.described is None or config.detection.image_kind == 'silhouette':
+        return lambda: ALIKE
+    return cache(partial(likeness, config.described, points, sheet, config.radius))
 
 
 def residuals_px(points: np.ndarray, views, centerlines) -> np.ndarray:

@@ -46,51 +46,95 @@ class Attempt:
         return self.fit.curve(2)[int(self.tip_is_last)]
 
 
-def tries(sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fit], tuple[np.ndarray, float, bool]], settles: Callable[[float], bool],
-          guess: Guess | None = None, leads: Sequence[Fit] = (), late: Callable[[], bool] = lambda: False,
-          first_sight: Callable[[np.ndarray], float] | None = None) -> tuple[list[Attempt], tuple]:
-    """All that was tried, and the line of each plane that stands out most, None where none does.
+class Search:
+    """A search of a pair of whole images. It may be interrupted between its steps, and go on later with the same pair.
 
     judge: features and log odds of a fit, and whether its last end is the tip.
     settles: whether a fit with these log odds needs no other beside it. leads: fits that stand already.
-    late: whether time is up, which once true stays so; asked before each step that takes long, and only where there is one left.
     first_sight: log odds of a curve (N, 3) that was not fitted; without it hypotheses are tried as they are proposed.
+    measured: what is made of a fit before it is judged.
     """
-    views, tried, seen = sheet.views, [], (None, None)
 
-    def settled() -> bool:
-        return bool(tried) and settles(max(t.log_odds for t in tried))
+    def __init__(self, sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fit], tuple[np.ndarray, float, bool]],
+                 settles: Callable[[float], bool], guess: Guess | None = None, leads: Sequence[Fit] = (),
+                 first_sight: Callable[[np.ndarray], float] | None = None, measured: Callable[[Fit], Fit] = lambda f: f):
+        self.tried: list[Attempt] = []
+        self.lines: tuple = (None, None)        # (N, 2) image pixels of the line of each plane that stands out most
+        self.finished = False
+        self._sheet, self._radius, self._min_length_px, self._guess = sheet, radius, min_length_px, guess
+        self._judge, self._settles, self._first_sight, self._measured = judge, settles, first_sight, measured
+        self._steps = self._all_steps(leads)
 
-    def go(hypotheses: Iterator[Hypothesis]) -> None:
+    def go_on(self, late: Callable[[], bool] = lambda: False) -> None:
+        """To the end, or until time is up, which is asked before each step that takes long, and only where there is one left."""
+        while not self.finished:
+            self.finished = next(self._steps, True)
+            if not self.finished and late():
+                return
+
+    def likeliest(self, radius: float, sheet: Sheet) -> list[Fit]:
+        """What it found, in another pair, which was taken a little later."""
+        best: list[Attempt] = []
+        for t in sorted(self.tried, key=lambda t: -t.log_odds):
+            if t.log_odds > PROMISING and all(exclusive(t, b) for b in best) and len(best) < 1 + LIKELIEST:
+                best.append(t)
+        fits = [at_rest(sheet, fit(sheet, t.fit.curve(200), radius, COARSE), radius) for t in best]
+        return [f for f in fits if f is not None and _long_enough(f, self._min_length_px)]
+
+    def _settled(self) -> bool:
+        return bool(self.tried) and self._settles(max(t.log_odds for t in self.tried))
+
+    def _all_steps(self, leads: Sequence[Fit]) -> Iterator[bool]:
+        """False before each step that takes long."""
+        sheet, radius = self._sheet, self._radius
+        self.tried += [Attempt(f, (None, None), *self._judge(f)) for f in leads if _long_enough(f, self._min_length_px)]
+        for faint in (False, True):
+            if self._settled():
+                break
+            yield False
+            found = candidates(sheet, radius, self._min_length_px, faint)
+            if not faint:
+                self.lines = tuple(lines[0].points_px if lines else None for lines in found)
+            hypotheses = by_lines(sheet.views, found)
+            yield from self._try(hypotheses if self._first_sight is None else _most_promising(hypotheses, self._first_sight))
+        if not self._settled() and (self._guess is not None or any(t.log_odds > PROMISING for t in self.tried)):
+            yield False
+            yield from self._try(_at_most(CLOSER, _again(sheet, radius, found, self.tried, self._guess)))
+
+    def _try(self, hypotheses: Iterator[Hypothesis | None]) -> Iterator[bool]:
         """Fit each; once one is beyond doubt, only the same lines read the other way round, and these however late it is."""
         last = None
         for h in hypotheses:
-            if settled() and not (last is not None and any(h.lines) and h.lines == last):
+            if h is None:
+                yield False
+                continue
+            if self._settled() and not (last is not None and any(h.lines) and h.lines == last):
                 break
             last = h.lines
             for _ in range(2):
-                if not settled() and late():
-                    return
-                fitted = fit(sheet, h.curve, radius, h.coarse, clearing=h.clearing)
-                if fitted is None or not (any(h.lines) or guess is None or borne_out(fitted.curve(100), guess)) or not _long_enough(fitted, min_length_px):
+                if not self._settled():
+                    yield False
+                fitted = fit(self._sheet, h.curve, self._radius, h.coarse, clearing=h.clearing)
+                if fitted is None or not self._may_be(fitted, h):
                     break
-                tried.append(Attempt(fitted, h.lines, *judge(fitted)))
-                if fitted.moved_px <= RESTLESS_PX or tried[-1].log_odds < HOPELESS:
+                final = self._measured(fitted)
+                self.tried.append(Attempt(final, h.lines, *self._judge(final)))
+                if fitted.moved_px <= RESTLESS_PX or self.tried[-1].log_odds < HOPELESS:
                     break
                 h = Hypothesis(fitted.curve(200), h.lines, clearing=h.clearing)     # it has not come to rest
 
-    tried += [Attempt(f, (None, None), *judge(f)) for f in leads if _long_enough(f, min_length_px)]
-    for faint in (False, True):
-        if settled() or late():
-            break
-        found = candidates(sheet, radius, min_length_px, faint)
-        if not faint:
-            seen = tuple(lines[0].points_px if lines else None for lines in found)
-        hypotheses = by_lines(views, found)
-        go(hypotheses if first_sight is None else _most_promising(hypotheses, first_sight))
-    if not settled() and (guess is not None or any(t.log_odds > PROMISING for t in tried)) and not late():
-        go(islice(_again(sheet, radius, found, tried, guess, late), CLOSER))
-    return tried, seen
+    def _may_be(self, f: Fit, h: Hypothesis) -> bool:
+        """Whether a fit is long enough, and, where no line but a guess led to it, bears that out."""
+        return _long_enough(f, self._min_length_px) and (any(h.lines) or self._guess is None or borne_out(f.curve(100), self._guess))
+
+
+def _at_most(count: int, hypotheses: Iterator[Hypothesis | None]) -> Iterator[Hypothesis | None]:
+    """So many of them, not counting None."""
+    for h in hypotheses:
+        yield h
+        count -= h is not None
+        if count == 0:
+            return
 
 
 def _most_promising(hypotheses: Iterator[Hypothesis], first_sight: Callable[[np.ndarray], float]) -> Iterator[Hypothesis]:
@@ -102,9 +146,9 @@ def _most_promising(hypotheses: Iterator[Hypothesis], first_sight: Callable[[np.
     yield from islice((others[k] for k in sorted(range(len(others)), key=lambda k: (-together[k], -odds[k]))), FITTED - AS_PROPOSED)
 
 
-def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Guess | None, late: Callable[[], bool]) -> Iterator[Hypothesis]:
+def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Guess | None) -> Iterator[Hypothesis | None]:
     """Where else it may be, when no pair of lines settled it: where a guess leads; the likeliest fits without the lines beside them, and beside these; where
-    the other plane shows what one plane's line alone says; and the likeliest again with a search around them."""
+    the other plane shows what one plane's line alone says; and the likeliest again with a search around them. None before what takes long."""
     path = None if guess is None else follow(sheet, guess, radius, clear=False)
     if path is not None:
         yield Hypothesis(path)
@@ -118,8 +162,7 @@ def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Gues
     paths = []
     for k, (view, lines) in enumerate(zip(views, found)):
         for c in lines[:SWEPT]:
-            if late():
-                return
+            yield None
             path = sweep(undistort(view, c.points_px), (view, views[1 - k]), (dark[k], dark[1 - k]))
             if path is not None and path.share > SEEN:
                 paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (c, None)[::1 - 2 * k]))

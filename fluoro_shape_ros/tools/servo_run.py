@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry.curve import arc_length, at_arc_length
-from ..device import load_device
 from ..resources import resource_path
 from ..sim import plant
 from ..sim.scenes import FRAME_ID
@@ -66,8 +65,8 @@ class Run:
 def commands(args, seed: int) -> dict[str, list[str]]:
     """The arguments of Python for each process."""
     robot = ['--robot', args.robot, '--seed', str(seed), '--rate', str(args.rate), '--size', str(args.size), *(['--device', args.device] if args.device else [])]
-    radius = ['-p', f'robot_radius:={load_device(args.device).radius}'] if args.device else []
-    return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'reference_frame:={FRAME_ID}', *radius],
+    device = ['-p', f'device:={args.device}'] if args.device else []
+    return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'reference_frame:={FRAME_ID}', *device],
             'robot': ['-m', 'fluoro_shape_ros.tools.servo_robot', *robot, *(['--no-anatomy'] if args.no_anatomy else [])],
             'controller': [str(resource_path('example_controller.py')), '--ros-args', '-p', f'robot:={args.robot}', '-p', f'rate:={float(args.rate)}']}
 

@@ -340,7 +340,7 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float, c
         elif end is not None:
             at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
         if end is not None and inner[k] < np.inf:
-            further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]), clutter / middle(seen.usual.reshape(2, -1)), step)
+            further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]), clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
     return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone)
