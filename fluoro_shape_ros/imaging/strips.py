@@ -94,7 +94,7 @@ class Sheet:
         u, v = places(centers, normals, offsets)
         for k, view in enumerate(self.views):
             if view.distortion is not None:
-                u[k], v[k] = distort(view, np.stack([u[k], v[k]], axis=2).reshape(-1, 2)).T.reshape(2, *u[k].shape)
+                u[k], v[k] = _distorted(view, u[k], v[k], offsets)
         np.minimum(np.maximum(v, -2, out=v), self.heights + 1, out=v)     # into the margin: what lies outside a plane looks like its border
         v += self.top
         return u, v
@@ -106,6 +106,14 @@ class Sheet:
     def exposed(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """(V, N, W) bool: whether they lie in the field."""
         return _remap(self.field, u, v, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT) > 0
+
+
+def _distorted(view: View, u: np.ndarray, v: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, W) places on strips after distortion, which over a strip is a parabola: known at three of its (W,) offsets, which are symmetric."""
+    x, at = offsets / offsets[-1], [0, len(offsets) // 2, -1]
+    known = distort(view, np.stack([u[:, at], v[:, at]], axis=2).reshape(-1, 2)).reshape(-1, 3, 2).astype(np.float32)
+    parabola = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2]).astype(np.float32)
+    return known[..., 0] @ parabola, known[..., 1] @ parabola
 
 
 def _remap(image: np.ndarray, u: np.ndarray, v: np.ndarray, interpolation: int, border: int) -> np.ndarray:
