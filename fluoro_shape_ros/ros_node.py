@@ -27,6 +27,7 @@ from msg_adapters.shapes import BadPath, path_to_points
 from . import params
 from .config import Config, ConfigError
 from .data import Frame, Outcome, Reconstruction
+from .labels import doubts
 from .limits import bounded
 from .outputs import Outputs
 from .pairing import PLANES, Pairer
@@ -54,7 +55,7 @@ class FluoroShapeNode(Node):
         self._config = params.declare(self)
         self._enabled, self._overdue, self._levels, self._room = True, False, None, WaitingRoom()
         self._trouble, self._namesakes, self._has_result = ('', 0.0), '', False     # which, since when
-        self._predictions = deque(maxlen=PREDICTIONS)
+        self._predictions, self._doubts = deque(maxlen=PREDICTIONS), ()
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
         self._tally, self._memory = Tally(), Memory()
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
@@ -105,8 +106,10 @@ class FluoroShapeNode(Node):
         if not self._enabled:
             return
         stamp, arrived, counts = stamp_ns(msg), time.monotonic(), self._pairer.counts
-        jumps, unstamped = counts.jumps, counts.unstamped
+        jumps, unstamped, unpaired = counts.jumps, counts.unstamped, counts.unpaired
         pair = self._pairer.add(plane, stamp, bounded(msg))
+        for _ in range(counts.unpaired - unpaired):
+            self._tally.event('unpaired')
         if counts.unstamped > unstamped:
             self._tally.event('unstamped')
         if counts.jumps > jumps:
@@ -155,6 +158,9 @@ class FluoroShapeNode(Node):
         pair, lost = self._room.take(tuple(self._books.values()), time.monotonic(), self._inputs.infos_may_be_lost)
         if pair is not None:
             cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
+            self._doubts = doubts(self._config, tuple(image.header.frame_id for image in pair.items), cameras)
+            if self._doubts:
+                self.get_logger().warn('; '.join(self._doubts), throttle_duration_sec=WARN_S)
             prediction = newest(self._predictions, pair.stamps[0])
             lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, prediction))
         self._drop(lost)
@@ -271,10 +277,11 @@ class FluoroShapeNode(Node):
         """Of the planes, of the pairing and of the reconstruction."""
         gap = self._pairer.gap_ns
         planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, **self._inputs.known(plane)) for plane in PLANES]
-        pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9)
+        pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9,
+                                      lossy=any(plane.reliability == 'best_effort' for plane in planes))
         fault = self._tally.reason('prediction')
         still = 'use_sim_time is set, but there is no /clock' if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else ''
-        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still, self._namesakes)))
+        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still, self._namesakes, *self._doubts)))
         results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes,
                                              overdue_s=self._overdue_s())
         return planes, pairing, results

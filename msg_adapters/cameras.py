@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from fluoro_shape_ros.data import Distortion, View
-from fluoro_shape_ros.geometry.cameras import GeometryError, make_view
+from fluoro_shape_ros.geometry.cameras import GeometryError, decompose, make_view
 
 from .messages import short
 
 LARGEST = 1e12      # no entry of a camera's matrices is beyond that, and arithmetic with it does not overflow
 LONGEST = 256       # characters of a frame_id, which every message of a result repeats, or of a model; coefficients of any kind
+NO_POSE = 1e-6         # rad and m: a pose smaller than that is none
 MOST_COEFFICIENTS = 14      # that OpenCV knows
 COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}      # how many D may have, but for zeros after them
 NAMES = {'fisheye': 'equidistant'}      # of models that others call otherwise
@@ -52,6 +53,12 @@ def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectifi
         return make_view(name, to_image @ P, image_shape[1], image_shape[0], distortion)
     except GeometryError as error:
         raise BadCameraInfo(str(error)) from error
+
+
+def has_pose(msg) -> bool:
+    """Whether P of a valid sensor_msgs/CameraInfo is not K [I | 0]: it takes points from another frame than the camera's own."""
+    _, R, t = decompose(np.reshape(msg.p, (3, 4)).astype(float))
+    return bool(np.abs(R - np.eye(3)).max() > NO_POSE or np.abs(t).max() > NO_POSE)
 
 
 def _image_from_full(msg, image_shape: tuple[int, int]) -> np.ndarray:

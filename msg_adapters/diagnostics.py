@@ -19,6 +19,8 @@ from .messages import New, header
 
 OK, WARN, ERROR, STALE = range(4)   # diagnostic_msgs/DiagnosticStatus
 WINDOW_S = 3.0      # over which rates and latencies are taken, and after which a silent stream is stale
+MISSING = 0.1       # share of the images without a partner from which on that is told where they may get lost
+LOST = 'best-effort images get lost on their way; over UDP the receive buffers must hold one (net.core.rmem_max, see docs/connect.md)'
 # what no better image would mend: something is not connected or configured as it must be
 FAULTS = {Outcome.BAD_IMAGE, Outcome.BAD_CAMERA_INFO, Outcome.NO_CAMERA_INFO, Outcome.NO_TRANSFORM, Outcome.BAD_GEOMETRY, Outcome.INTERNAL_ERROR}
 
@@ -62,6 +64,8 @@ class PairingSummary:
     both_alive: bool = False        # images come in both planes
     unstamped: bool = False         # images without a stamp came lately
     jumped: bool = False            # stamps jumped back lately
+    unpaired_hz: float = 0.0        # images given up
+    lossy: bool = False             # images are taken best-effort
 
 
 @dataclass(frozen=True)
@@ -111,21 +115,27 @@ def plane_status(s: PlaneSummary) -> Status:
 
 def _nobody(s: PlaneSummary) -> str:
     topics = s.unheard()
-    return f': nobody publishes {topics}' if topics else ''
+    if topics:
+        return f': nobody publishes {topics}'
+    return f': {LOST}' if s.publishers and s.reliability == 'best_effort' else ''
 
 
 def pairing_status(s: PairingSummary) -> Status:
     """What is to be said of the pairing of the two streams."""
     c = s.counts
     quiet = s.silent_s is None or s.silent_s > WINDOW_S
+    missing = s.unpaired_hz / max(s.unpaired_hz + 2 * s.rate_hz, 1e-9) if s.lossy else 0.0
     if s.unstamped:
         level, message = ERROR, 'images without a stamp (zero) can\'t be paired'
     elif s.jumped:
         level, message = WARN, 'stamps jumped back: everything before was forgotten'
     elif quiet and s.both_alive and s.gap_s is not None:
         level, message = WARN, f'nothing pairs: the newest stamps differ by {abs(s.gap_s) * 1e3:.1f} ms, sync_slop is {s.slop_s * 1e3:.1f} ms'
+        message += f'; or {LOST}' if missing > MISSING else ''
     elif quiet:
         level, message = STALE, 'no pair yet' if s.silent_s is None else f'no pair for {s.silent_s:.0f} s'
+    elif missing > MISSING:
+        level, message = WARN, f'{100 * missing:.0f} % of the images have no partner: {LOST}'
     else:
         level, message = OK, f'{s.rate_hz:.1f} pairs/s' + (f', {s.dropped_hz:.1f} of them dropped: they come faster than they are processed' if s.dropped_hz else '')
     return Status('pairing', level, message, {
@@ -253,7 +263,7 @@ class Tally:
     def pairing(self, counts: Counts, **known) -> PairingSummary:
         return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), dropped_hz=self.rate_hz('dropped'), silent_s=self.silent_s('pair'),
                               both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'),
-                              jumped=self.lately('jump'), **known)
+                              jumped=self.lately('jump'), unpaired_hz=self.rate_hz('unpaired'), **known)
 
     def reconstruction(self, **known) -> ReconstructionSummary:
         done, good = self._result, f'outcome {Outcome.OK.value}'

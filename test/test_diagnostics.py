@@ -6,7 +6,7 @@ import pytest
 
 from fluoro_shape_ros.data import Outcome, Reconstruction
 from fluoro_shape_ros.pairing import Counts
-from msg_adapters.diagnostics import (ERROR, OK, STALE, WARN, WINDOW_S, PairingSummary, PlaneSummary, ReconstructionSummary, Status, Tally,
+from msg_adapters.diagnostics import (ERROR, LOST, OK, STALE, WARN, WINDOW_S, PairingSummary, PlaneSummary, ReconstructionSummary, Status, Tally,
                                       diagnostic_array, pairing_status, plane_status, reconstruction_status, trouble)
 
 
@@ -36,6 +36,8 @@ def tally(clock):
     (PlaneSummary('a', silent_s=0.1, unheard=lambda: '/plane_a/camera_info'), ERROR, 'no camera info yet: nobody publishes /plane_a/camera_info'),
     (PlaneSummary('a', silent_s=0.1, has_camera=True, publishers=2), WARN, '2 publishers'),
     (PlaneSummary('a', silent_s=0.1, has_camera=True, fell_back=True), WARN, 'best-effort'),
+    (PlaneSummary('a', publishers=1, reliability='best_effort'), STALE, f'no image yet: {LOST}'),
+    (PlaneSummary('a', silent_s=9.0, has_camera=True, publishers=1, reliability='best_effort'), STALE, f'no image for 9 s: {LOST}'),
     (PlaneSummary('a', silent_s=9.0, image_fault='too short'), ERROR, 'bad image: too short'),
     (PlaneSummary('a', silent_s=0.1, camera_fault='K is zero'), ERROR, 'camera info refused: K is zero'),
     (PlaneSummary('a', silent_s=0.1, camera_fault='K is zero', has_camera=True), WARN, 'the one before holds: K is zero'),
@@ -50,6 +52,10 @@ def test_plane(summary, level, words):
     (PairingSummary(Counts(), 0.01, both_alive=True, gap_s=-0.03), WARN, 'differ by 30.0 ms, sync_slop is 10.0 ms'),
     (PairingSummary(Counts(), 0.01, silent_s=0.1, rate_hz=7.5), OK, '7.5 pairs/s'),
     (PairingSummary(Counts(), 0.01, silent_s=0.1, rate_hz=30.0, dropped_hz=12.0), OK, '30.0 pairs/s, 12.0 of them dropped'),
+    (PairingSummary(Counts(), 0.01, silent_s=0.1, rate_hz=2.0, unpaired_hz=6.0, lossy=True), WARN, f'60 % of the images have no partner: {LOST}'),
+    (PairingSummary(Counts(), 0.01, silent_s=0.1, rate_hz=15.0, unpaired_hz=1.0, lossy=True), OK, '15.0 pairs/s'),
+    (PairingSummary(Counts(), 0.01, silent_s=0.1, rate_hz=15.0, unpaired_hz=15.0), OK, '15.0 pairs/s'),      # 30/s beside 15/s
+    (PairingSummary(Counts(), 0.01, both_alive=True, gap_s=-0.03, unpaired_hz=6.0, lossy=True), WARN, f'sync_slop is 10.0 ms; or {LOST}'),
     (PairingSummary(Counts(), 0.01, silent_s=20.0), STALE, 'no pair for 20 s'),
     (PairingSummary(Counts(), 0.01, silent_s=0.1, jumped=True), WARN, 'jumped back'),
     (PairingSummary(Counts(), 0.01, silent_s=0.1, unstamped=True), ERROR, 'without a stamp'),

@@ -323,7 +323,7 @@ def test_an_error_of_the_program_costs_its_pair_and_the_exit_code(run, tmp_path,
 def test_parameters_from_file_and_command_line(tmp_path):
     path = tmp_path / 'params.yaml'
     path.write_text('/**:\n  ros__parameters:\n    use_sim_time: true\n    robot_radius: 1e-3\n    polarity: bright\n'
-                    'fluoro_shape:\n  ros__parameters:\n    polarity: auto\n    expected_length: [0.01, 1]\n    tracking: false\nother:\n  ros__parameters: {x: 1}\n')
+                    'fluoro_shape:\n  ros__parameters:\n    polarity: auto\n    expected_length: [0.01, 1.0]\n    tracking: false\nother:\n  ros__parameters: {x: 1}\n')
     values = read_parameters(str(path), ['tracking=true', 'spacing_px:=1e1', 'base_position=[1, 2e-1, 3]'])
     assert values == dict(robot_radius=1e-3, polarity='auto', expected_length=(0.01, 1), tracking=True, spacing_px=10.0, base_position=(1, 0.2, 3))
     assert Config.from_values(**values).detection.robot_radius == 0.001

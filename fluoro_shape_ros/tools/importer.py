@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from msg_adapters.calibration import BadCalibration, Calibration, calibration_to_camera_info
 from msg_adapters.calibration_files import UNITS
-from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
+from msg_adapters.cameras import BadCameraInfo, camera_info_to_view, has_pose
 from msg_adapters.images import BadImage, array_to_image
 
 from ..geometry.cameras import GeometryError, check_pair
@@ -106,10 +106,12 @@ def _import(args, parser: argparse.ArgumentParser) -> None:
         stamps, guessed = stamps_of([s.count for s in sources], [s.times_ns for s in sources], args.rate, args.stamps)
         pairs, unpaired = count_pairs(stamps)
         with create_bag(args.out, args.storage) as bag:
-            notes += write_run(bag, sources, stamps, args.frame_ids)
+            more, posed = write_run(bag, sources, stamps, args.frame_ids)
     except (BadCalibration, BadCameraInfo, BadImage, BadBag, BadDicom, GeometryError) as error:
         raise ToolError(str(error)) from error
-    print('\n'.join([f'{pairs} pairs in {args.out}', *notes, *sources[0].notes, *sources[1].notes, *guessed, *unpaired]))
+    print('\n'.join([f'{pairs} pairs in {args.out}', *notes, *more, *sources[0].notes, *sources[1].notes, *guessed, *unpaired]))
+    if posed:
+        print(f'results will be in the frame of the calibrations: name it, fluoro_shape_replay {args.out} --out results -p reference_frame=isocenter', file=sys.stderr)
 
 
 def dicom_sources(args, known: list[Calibration | None]) -> list[Source]:
@@ -135,8 +137,10 @@ def image_source(files: list[Path], calibration: Calibration) -> Source:
     return Source(count, repeat(calibration), chain.from_iterable(map(read_images, opened)), even_stamps(rate_hz, count) if rate_hz else None)
 
 
-def write_run(bag, sources: list[Source], stamps_ns: list[list[int]], frame_ids: list[str]) -> list[str]:
-    """Write both planes to `bag` (of create_bag) in the order of their stamps: with every image its camera info. Returns what is to be said of the cameras.
+def write_run(bag, sources: list[Source], stamps_ns: list[list[int]], frame_ids: list[str]) -> tuple[list[str], bool]:
+    """Write both planes to `bag` (of create_bag) in the order of their stamps: with every image its camera info.
+
+    Returns what is to be said of the cameras, and whether P of plane A has a pose, so that results are not in its own frame.
 
     Raises BadImage and BadDicom for an image that can't be read, BadCameraInfo for a camera that can't be one or not this image's,
     GeometryError for planes that can't see depth.
@@ -144,7 +148,7 @@ def write_run(bag, sources: list[Source], stamps_ns: list[list[int]], frame_ids:
     for plane in PLANES:
         bag.declare(f'/plane_{plane}/camera_info', 'sensor_msgs/msg/CameraInfo')
         bag.declare(f'/plane_{plane}/image_raw', 'sensor_msgs/msg/Image')
-    views, notes = {}, []
+    views, notes, posed = {}, [], False
     entries = heapq.merge(*(zip(stamps, repeat(k), s.calibrations, s.frames) for k, (s, stamps) in enumerate(zip(sources, stamps_ns))), key=itemgetter(0, 1))
     for stamp_ns, k, calibration, image in tqdm(entries, 'importing', sum(map(len, stamps_ns)), unit='image', disable=None):
         plane, frame_id = PLANES[k], frame_ids[k]
@@ -152,13 +156,14 @@ def write_run(bag, sources: list[Source], stamps_ns: list[list[int]], frame_ids:
             calibration = replace(calibration, width=image.shape[1], height=image.shape[0])
         info = calibration_to_camera_info(calibration, stamp_ns, frame_id, bag.new)
         views[plane] = camera_info_to_view(info, plane, image.shape)
+        posed |= plane == PLANES[0] and has_pose(info)
         bag.write(f'/plane_{plane}/camera_info', info, stamp_ns)
         bag.write(f'/plane_{plane}/image_raw', array_to_image(image, stamp_ns, frame_id, bag.new), stamp_ns)
         if len(views) == 2:
             pair = tuple(views[p] for p in PLANES)
             check_pair(pair)
             notes = notes or scale_notes(pair)
-    return notes
+    return notes, posed
 
 
 if __name__ == '__main__':

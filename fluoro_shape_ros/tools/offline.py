@@ -31,6 +31,7 @@ from msg_adapters.messages import stamp_ns
 
 from ..config import Config
 from ..data import Frame, Outcome, Reconstruction
+from ..labels import doubts
 from ..pairing import PLANES, Counts, Pairer
 from ..method.pipeline import reconstruct
 from ..worker import Camera, Job, Lookup, Memory, adapt, camera, checked_camera, decode, image_window, view_of
@@ -41,6 +42,7 @@ MAX_NS = 2**63 - 1
 LATE_NS = 10**9         # a camera info is not recorded later than this after the image for which it holds
 AHEAD = 8               # images read before they are asked for
 BAR = '{l_bar}{bar}| {n:.1f}/{total:.1f} s [{elapsed}<{remaining}]'
+NO_FRAMES = '', ''      # those of the images are compared in `_jobs`
 NUMBERS = re.compile(r'-?\d+(\.\d+)?(e[-+]?\d+)?')
 Copy = Callable[[object, int], None]    # takes a Recorded and its stamp in ns
 
@@ -133,6 +135,7 @@ class Offline:
             begin = time.perf_counter()
             frame, result = answer(job, self._memory, self._views, self._poses)
             summary.count(job.stamp_ns, result)
+            summary.warnings.update(doubts(job.config, NO_FRAMES, job.cameras))
             summary.counts = dataclasses.replace(self._pairer.counts)   # as far as it got, should it be interrupted
             yield Answer(job, frame, result, time.perf_counter() - begin, log_ns)
         summary.counts = dataclasses.replace(self._pairer.counts, unpaired=self._pairer.counts.unpaired + self._pairer.waiting)

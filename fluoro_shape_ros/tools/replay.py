@@ -19,10 +19,11 @@ from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, diagnostic
 
 from ..config import Config, ConfigError
 from ..data import Outcome
+from ..labels import doubts
 from ..pairing import PLANES
 from .cli import ToolError, count, need, run
 from .exports import Arrays, Table, writing
-from .offline import Answer, Offline, Topics
+from .offline import NO_FRAMES, Answer, Offline, Topics
 from .parameters import NODE, read_parameters
 from .recorded_tf import NAMES as TF
 from .recorded_tf import TF_TYPE
@@ -90,7 +91,7 @@ def replay(args, parser: argparse.ArgumentParser) -> int:
     from msg_adapters.bags import BadBag
 
     try:
-        config = Config.from_values(**read_parameters(args.params, args.param))
+        config = Config.from_values(**read_parameters(args.params, args.param, lambda words: print(f'{parser.prog}: {words}', file=sys.stderr)))
         names = topic_names(args)
     except ValueError as error:
         parser.error(str(error))
@@ -141,10 +142,10 @@ def _replay(args, config: Config, topics: Topics, names: dict[str, str], parser:
     from msg_adapters.bags import create_bag, open_bag
 
     failures, interrupted = [], False
-    with open_bag(args.bags[0]) as bag:
+    with open_bag(args.bags[0]) as bag, _damage_told(bag):
         check_topics(bag.types(), topics)
         if topics.tf and not bag.types().keys() & topics.tf.keys():
-            parser.error(f'geometry: tf needs {" and ".join(topics.tf)}, of which none is in the bag; record them with the images')
+            parser.error(f'geometry: tf needs {" and ".join(topics.tf)}, of which none is in the bag; record them with the images' + (bag.damage and f'; {bag.damage}'))
         with create_bag(args.out, args.storage) as out:
             history = None
             sinks = [Results(out, names), *(kind(path) for kind, path in ((Table, args.csv), (Arrays, args.npz)) if path)]
@@ -191,6 +192,15 @@ def feed(answers: Iterable[Answer], sinks: list, failures: list[str]) -> None:
 
 
 @contextlib.contextmanager
+def _damage_told(bag):
+    """What is damaged in the bag, or missing, may be why something fails."""
+    try:
+        yield
+    except ToolError as error:
+        raise ToolError('; '.join(filter(None, (str(error), bag.damage, bag.missing)))) from error
+
+
+@contextlib.contextmanager
 def _kept(failures: list[str], then=lambda: None):
     """A failure of one output is for the end: the others go on."""
     try:
@@ -233,9 +243,10 @@ class Results:
     def take(self, answer: Answer) -> None:
         """Write the result of a pair."""
         out, names, result, stamp, frame_id = self._out, self._names, answer.result, answer.job.stamp_ns, answer.job.frame_id
-        level = ERROR if result.outcome in FAULTS else WARN if result.outcome is not Outcome.OK or result.warnings else OK
+        notes = (*result.warnings, *doubts(answer.job.config, NO_FRAMES, answer.job.cameras))
+        level = ERROR if result.outcome in FAULTS else WARN if result.outcome is not Outcome.OK or notes else OK
         reason = ': '.join(filter(None, (result.outcome.value, result.detail)))
-        status = Status('reconstruction', level, '; '.join((reason, *result.warnings)), {
+        status = Status('reconstruction', level, '; '.join((reason, *notes)), {
             'last outcome': result.outcome.value, 'last detail': result.detail, 'confidence': probability(result.confidence), 'warnings': ', '.join(result.warnings)})
         out.write(DIAGNOSTICS, diagnostic_array([status], stamp, f'/{NODE}', out.new), stamp)
         if result.shape is not None:
