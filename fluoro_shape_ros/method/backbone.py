@@ -34,7 +34,7 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     near, weights = f.spline.weights(at, 0)
     covariance = np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near]) + _displaced(f, views, points, tangents, at)
     tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
-    sigma = f.end_sigma if forward else f.end_sigma[::-1]
+    sigma = np.hypot(f.end_sigma, f.end_model)[::1 if forward else -1]
     covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
     known = [np.isfinite(o) for o in f.offset_px.T]
     residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan) if k.any() else np.full(len(at), np.nan)

@@ -24,6 +24,7 @@ MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose
 TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
 FARTHEST = 12.0         # nats, in the same way
+BY_CHANCE = 2.0         # deviations, that the darkest of some places beside the device stands out by
 SKETCHED_PX = 2         # between the strips of a curve that was not fitted
 
 
@@ -34,18 +35,16 @@ class Features:
     weakest: float      # ln of the lowest signal to noise of three blocks in a row
     seen: float         # share of the blocks darker than nearly all places beside the curve
     symmetric: float    # odd part of the mean profile, as a share of its even part
-    width: float        # |ln| of the width seen to that expected
-    uneven: float       # how differently, as a logarithm, the planes show its darkness change along it
+    wide: float         # ln of the width seen to that expected, where it is wider ...
+    narrow: float       # ... and the other way round
     residual: float     # px rms, of the device from the curve
     sigma: float        # ln of the curve's, as a share of what it may be off by
     tip_stops: float    # how much darker it is before its tip than past it, as a share of its darkness
     tip_shown: float    # darkness of its last BLOCK before the tip, as a share of its darkness
-    base_stops: float   # the same of its base
-    base_shown: float
+    base_stops: float   # as tip_stops
     tip_sigma: float    # ln of the tip's along the curve, as a share of what it may be off by
-    tip_aside: float    # darkness of a line beside where it would go on
+    tip_aside: float    # darkness of a line beside where it would go on, beyond what places beside it happen to look like
     tip_farther: float  # nats by which both planes show it going on past its tip
-    base_farther: float
     no_tip: float       # 1 where it leaves the field at both ends
     length: float       # ln px
     hidden: float       # ends that only one plane shows
@@ -68,8 +67,8 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
     return np.array([
         *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
-        stops[tip], shown[tip], stops[1 - tip], shown[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, min(fit.aside[tip].max(), 2.0),
-        min(fit.farther[tip], FARTHEST), min(fit.farther[1 - tip], FARTHEST), fit.open_end.all(), np.log(count), (fit.alone >= 0).sum()], float)
+        stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, np.clip((fit.aside[tip] - BY_CHANCE * fit.clutter).max(), 0.0, 2.0),
+        min(fit.farther[tip], FARTHEST), fit.open_end.all(), np.log(count), (fit.alone >= 0).sum()], float)
 
 
 def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarray:
@@ -98,10 +97,9 @@ def _seen(spline: Spline3, start: float, stop: float, step: float, sheet: Sheet,
 
 def _everywhere(seen: list[dict]) -> tuple[float, ...]:
     """The features of what each plane shows along all of a curve, in the order of NAMES."""
-    a, b = (np.log(np.clip(p['blocks'], 0.05, None)) for p in seen)
-    uneven = np.median(np.abs(a - b - np.median(a - b)))
+    width = np.array([p['width'] for p in seen])
     return (np.log(np.clip(min(p['run'] for p in seen), FAINTEST, CLEAREST)), min(p['share'] for p in seen), max(p['odd'] for p in seen),
-            max(abs(p['width']) for p in seen), min(float(uneven), 3.0))
+            max(width.max(), 0.0), max(-width.min(), 0.0))
 
 
 def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, block: int) -> dict:
@@ -122,16 +120,23 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, bl
     usual = max(float(middle(on)), 1e-9)
     ratio = on / spread
     run = np.convolve(ratio, np.ones(3) / 3, 'valid') if number >= 3 else ratio
-    mean = middle(profiles[PAST:PAST + count], axis=0)
-    background = np.polyval(np.polyfit(x[flank], mean[flank], 2), x)
     near = np.abs(x) <= 2 * half + 2
-    shadow = (background - mean)[near]
-    even, odd = 0.5 * (shadow + shadow[::-1]), 0.5 * (shadow - shadow[::-1])
-    positive = np.maximum(even, 0)
+    curve = np.vander(x, 3)
+    mean = profiles[PAST:PAST + number * block].reshape(number, block, -1).mean(axis=1)
+    shadow = (mean[:, flank] @ np.linalg.pinv(curve[flank]).T @ curve.T - mean)[:, near]
+    even, even_error = _typical(0.5 * (shadow + shadow[:, ::-1]))
+    odd, odd_error = _typical(0.5 * (shadow - shadow[:, ::-1]))
+    positive = even * (even > 2 * even_error)
     # a cylinder's chords have a standard deviation of half its radius
     seen_width = np.sqrt((positive * x[near]**2).sum() / (positive.sum() + 1e-12)) / np.hypot(radius_px / 2, BLUR_PX)
     each = dark[:, np.abs(x) <= 1].max(axis=1) / usual
     ends = [(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()), (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())]
-    odd_share = np.sqrt((odd**2).sum() / ((even**2).sum() + 1e-12))
+    odd_share = np.sqrt(max((odd**2 - odd_error**2).sum(), 0.0) / ((even**2).sum() + 1e-12))
     return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0), width=float(np.log(np.clip(seen_width, 0.3, 3.0))),
-                blocks=on / usual, stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))
+                stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))
+
+
+def _typical(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(W,) median of (N, W) values, and the standard error of that, from their own scatter."""
+    mid = np.median(values, axis=0)
+    return mid, 1.4826 * np.sqrt(np.pi / 2 / len(values)) * np.median(np.abs(values - mid), axis=0)

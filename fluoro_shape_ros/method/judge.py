@@ -25,16 +25,16 @@ BEYOND_DOUBT = 0.97     # confidence from which on nothing else is tried, unless
 PREDICTED = 1.0         # what a prediction that a curve bears out adds to its log odds
 NEAR, FAR, LIMIT = 0.7, 2.0, 6.0        # scales: what is worse by less says nothing, by more it says more, and in the end no more
 # +1: the more the likelier it is right, -1: the less
-SIGNS = dict(weakest=1, seen=1, symmetric=-1, width=-1, uneven=-1, residual=-1, sigma=-1, tip_stops=1, tip_shown=1, base_stops=1, base_shown=1,
-             tip_sigma=-1, tip_aside=-1, tip_farther=-1, base_farther=-1, no_tip=-1, length=1, hidden=-1)
+SIGNS = dict(weakest=1, seen=1, symmetric=-1, wide=-1, narrow=-1, residual=-1, sigma=-1, tip_stops=1, tip_shown=1, base_stops=1,
+             tip_sigma=-1, tip_aside=-1, tip_farther=-1, no_tip=-1, length=1, hidden=-1)
 REASONS = dict(
     weakest='part of it hardly stands out from what lies beside it',
     seen='one plane does not show all of it', symmetric='one side of it is darker than the other, as at an edge',
-    width='it looks wider or narrower than robot_radius', uneven='its darkness changes along it otherwise in one plane than in the other',
+    wide='it looks wider than robot_radius', narrow='it looks narrower than robot_radius',
     residual='the planes disagree where it runs', sigma='its course is uncertain',
     tip_stops='one plane shows it going on past its tip', tip_shown='one plane hardly shows its tip',
-    base_stops='one plane shows it going on past its base', base_shown='one plane hardly shows its base', tip_sigma='where its tip is, is uncertain',
-    tip_aside='a line goes on beside its tip', tip_farther='it goes on past its tip', base_farther='it goes on past its base',
+    base_stops='one plane shows it going on past its base', tip_sigma='where its tip is, is uncertain',
+    tip_aside='a line goes on beside its tip', tip_farther='it goes on past its tip',
     no_tip='it leaves the field at both ends',
     length='it is short',
     hidden='only one plane shows one of its ends')

@@ -42,6 +42,7 @@ GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in eithe
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
 CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
+SLANTED = 0.2           # of the length over which an end fades, that its model is worth in the plane that sees it straightest (measured, `wide`)
 HARD_PX = 1.0           # what an end is worth that only one plane shows, or that is hard to see in both
 
 
@@ -53,6 +54,7 @@ class Fit:
     start: float                # m, arc length where the device begins ...
     stop: float                 # ... and where it ends
     end_sigma: np.ndarray       # (2,) m, of those two along the curve
+    end_model: np.ndarray       # (2,) m, what the model of a slanting end is worth, beside that
     open_end: np.ndarray        # (2,) bool: the device leaves the field there
     covariance: np.ndarray      # (3 n, 3 n) m^2 of the control points
     s: np.ndarray               # (N,) m
@@ -61,6 +63,7 @@ class Fit:
     across: np.ndarray          # (2,) share of the beam that the device takes at its middle, after blur, as if seen straight on (Beer-Lambert)
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
+    clutter: np.ndarray         # (2,) how dark places beside it happen to look, as a share of its darkness
     farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, see `_Pair.farther`
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
     moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not come to rest
@@ -303,9 +306,9 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width, ra
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
-    return Fit(solution.spline, *start_stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
+    return Fit(solution.spline, *start_stop, np.zeros(2), np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
                across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
-               np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
+               np.nan_to_num(found.clutter / middle(seen.usual), nan=1.0), np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
 
 
 def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray]:
@@ -331,8 +334,9 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float, c
     presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))      # (ends, planes, strips)
     there = speed[:, :, len(window) // 2]
     height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
-    again = locate(s, presence / height[..., None], seen.presence_sigma.reshape(2, 2).T / height, speed, at, OUTWARD,
-                   *_shape_of_end(there, scale, f.across, radius), density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
+    shape = _shape_of_end(there, scale, f.across, radius)
+    again = locate(s, presence / height[..., None], seen.presence_sigma.reshape(2, 2).T / height, speed, at, OUTWARD, *shape,
+                   density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
     hard, sigma = crowded(f), np.zeros(2)
     for k, (end, v) in enumerate(zip(ends, alone)):
         if v >= 0 and np.isfinite(again[k].seen_at[v]):
@@ -343,7 +347,7 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float, c
             further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]), clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
-    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone)
+    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, end_model=SLANTED * shape[1].min(axis=1) * ~f.open_end, alone=alone)
 
 
 def _shown_by_one(f: Fit) -> np.ndarray:
