@@ -25,8 +25,6 @@ class Outcome(Enum):
     NO_CORRESPONDENCE = 'no_correspondence'
     CURVATURE = 'curvature_too_high'
     REPROJECTION = 'reprojection_too_large'
-    DIRECTIONS_DISAGREE = 'directions_disagree'
-    POORLY_EXPLAINED = 'centerline_poorly_explained'
     LENGTH = 'length_out_of_bounds'
     TIP_UNCERTAIN = 'tip_too_uncertain'
     LOW_CONFIDENCE = 'confidence_too_low'

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fluoro_shape_ros.geometry.cameras import project
+from fluoro_shape_ros.geometry.cameras import project, source
 from fluoro_shape_ros.geometry.curve import arc_length, resample
 from fluoro_shape_ros.geometry.spline import through
 from fluoro_shape_ros.imaging.field import field_of_view
 from fluoro_shape_ros.imaging.prepare import sheet_of
-from fluoro_shape_ros.method.features import BLOCK, NAMES, Features, features
+from fluoro_shape_ros.method.features import BLOCK, NAMES, Features, at_first_sight, features
 from fluoro_shape_ros.method.fit.fit import fit
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
@@ -222,3 +222,25 @@ def test_the_same_fit_says_the_same_again():
     before = sheet.image.copy()
     assert_array_equal(list(named(f, sheet).values()), list(named(f, sheet).values()))
     assert_array_equal(sheet.image, before)
+
+
+@pytest.mark.parametrize('anatomy', [False, True])
+def test_at_first_sight_a_curve_says_about_what_its_fit_does(anatomy):
+    sheet, f = known(anatomy)
+    sketched = dict(zip(NAMES, at_first_sight(f.curve(100), sheet, run(anatomy).radius)))
+    told = [n for n in NAMES if np.isfinite(sketched[n])]
+    assert {'weakest', 'seen', 'symmetric', 'wide', 'length'} <= set(told) and not np.isfinite(sketched['tip_sigma'])
+    assert_allclose([sketched[n] for n in told], [expected(anatomy)[n] for n in told], atol=0.5)
+    beside = dict(zip(NAMES, at_first_sight(f.curve(100) + 0.004, sheet, run(anatomy).radius)))
+    assert beside['weakest'] < sketched['weakest'] - 1
+
+
+def test_a_curve_that_goes_to_a_source_is_not_seen():
+    sheet, f = known()
+    towards = np.linspace(f.curve(2)[0], sources()[0], 50)
+    sight = dict(zip(NAMES, at_first_sight(towards, sheet, run(False).radius)))
+    assert sight['seen'] == 0 and np.isnan(sight['length'])
+
+
+def sources():
+    return [source(v.P) for v in VIEWS]

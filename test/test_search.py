@@ -340,7 +340,8 @@ def test_lines_along_epipolar_lines_fit_both_ways_round_and_both_count(seed):
     truth = scene.truth
     answer = reconstruct(scene.frame, Config.from_values(robot_radius=scene.radius, base_position=truth[0].tolist()))
     if answer.outcome is Outcome.OK:
-        assert cKDTree(truth).query(answer.shape.points)[0].max() < 0.5e-3
+        off = cKDTree(truth).query(answer.shape.points)[0]      # the wrong way round is some mm off; the base, along the epipolar line, is known to 1 mm only
+        assert off.mean() < 0.1e-3 and off[-20:].max() < 0.5e-3 and off.max() < 1e-3
     else:
         assert answer.outcome is Outcome.LOW_CONFIDENCE and answer.confidence < Config().plausibility.min_confidence
 

@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import ndtr
 
 from fluoro_shape_ros.data import Distortion
-from fluoro_shape_ros.geometry.cameras import decompose, project, undistort
+from fluoro_shape_ros.geometry.cameras import decompose, distort, project, undistort
 from fluoro_shape_ros.sim.carm import CArm, view
 from fluoro_shape_ros.imaging.profiles import (WIDTHS, apparent_width, background, contrast_of, likeness, mean_profile, odd_width, own_shadow, pieces,
                                        shadow, straight_on)
-from fluoro_shape_ros.imaging.strips import FOUND_PX, Measurement, Model, Sheet, Strips, cut, cut_along, half_width_range, measure, search
+from fluoro_shape_ros.imaging.strips import FOUND_PX, Measurement, Model, Sheet, Strips, clutter, cut, cut_along, half_width_range, lay_out, measure, search
 
 HALF_WIDTH = 2.0        # px
 PX = 0.3e-3             # m at the isocentre
@@ -273,3 +273,23 @@ def test_how_wide_a_line_looks_and_when_that_is_odd():
     assert odd_width(0.88, 2.0) == odd_width(1.0, 2.0) == odd_width(0.7, 2.0) == 0
     assert odd_width(1.5, 2.0) > odd_width(1.4, 2.0) > 0 and odd_width(0.4, 2.0) > 0
     assert odd_width(1.5, 1.0) < odd_width(1.5, 2.0) < odd_width(1.5, 4.0)     # the fewer pixels, the less is known
+
+
+@pytest.mark.parametrize('direction', [(0.2, 0, 1), (1, 0, 0.4)])
+def test_clutter_is_what_noise_makes_of_a_line_that_is_not_there(direction):
+    """A matched filter of unit depth has the standard deviation noise / |shadow|, over `along` rows its root less; the device in the middle does not count."""
+    shape = shadow(HALF_WIDTH, np.arange(-6, 7))
+    for noise, depth in ((3.0, 0.0), (3.0, 60.0), (6.0, 0.0)):
+        spread = clutter(strips_of(direction, noise=noise, depth=depth, reach=40), shape[None], 12.0, 3)
+        assert_allclose(spread, noise / np.linalg.norm(shape - shape.mean()) / np.sqrt(3), rtol=0.3)      # interpolation smooths a little
+
+
+def test_distortion_is_known_at_three_offsets_of_a_strip():
+    bent = replace(VIEW, distortion=Distortion('plumb_bob', decompose(VIEW.P)[0], np.array([-0.3, 0.1, 1e-3, -1e-3, 0.0]), np.eye(3)))
+    sheet = Sheet.of([draw((1, 0, 0.4))], [FIELD], [bent])
+    centers, normals, _ = (x for x in lay_out([bent], *line((1, 0, 0.4))))
+    offsets = np.arange(-20.0, 21.0)
+    u, v = sheet.places(centers, normals, offsets)
+    exact = distort(bent, (centers[0][:, None] + normals[0][:, None] * offsets[:, None]).reshape(-1, 2)).reshape(-1, 41, 2)
+    inside = (exact[..., 1] > 0) & (exact[..., 1] < 255)
+    assert np.abs(np.stack([u[0], v[0] - sheet.top[0]], axis=-1) - exact)[inside].max() < 0.01
