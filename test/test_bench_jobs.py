@@ -120,7 +120,7 @@ def test_a_killed_worker_changes_no_number(cluster, tmp_path, monkeypatch):
     for seed in range(10):
         save(tmp_path / 'scenes' / str(seed), drawn(seed))
     hide(tmp_path / 'scenes' / '5')
-    tasks = [Task('open', seed, ('spline',), sources=Sources(open=tmp_path / 'scenes')) for seed in range(10)]
+    tasks = [Task('open', seed, ('spline',), sources=Sources(open=tmp_path / 'scenes'), min_confidence=0.5) for seed in range(10)]
     expected = [numbers(trial) for trial in jobs.in_order(attempt, tasks, 2)]
     assert {t['answers']['spline']['right'] for t in expected} == {True, False}
     one, other = cluster.workers(2)

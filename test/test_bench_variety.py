@@ -25,7 +25,7 @@ REFUSED = Answer(0, Outcome.LENGTH, cpu_s=0.5)
 
 
 def drawn(seed):
-    """A scene that takes hundredths of a second. Seeds 0, 1 and 3 are answered rightly, 2 is refused."""
+    """A scene that takes hundredths of a second; so few px of a device are found, but not believed with the usual confidence."""
     return scenes.xray_run(seed, views=SMALL, lengths=(0.067, 0.1), anatomy=False, radius=0.001).scene()
 
 
