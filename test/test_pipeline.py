@@ -26,6 +26,7 @@ SIZE = 512
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
 RUN = dict(views=VIEWS, lengths=(0.06, 0.07))
 SAME = 0.02e-3          # m: what only the order of arithmetic may change
+ROUNDING = 0.03e-3     # 0.1 px: OpenCV 4 rounds the places that it samples to 1/32 px, otherwise for a fit that began elsewhere
 NOISE = 0.2e-3          # m: three standard deviations of an end, for what samples other pixels
 
 
@@ -297,7 +298,7 @@ def cut_short(shape, lost, end):
 def test_tracking_changes_nothing(scene, config, answer):
     previous = replace(answer.shape, points=answer.shape.points + [0.4e-3, -0.4e-3, 0.4e-3])
     for prior in (Prior(previous=answer.shape), Prior(previous=previous)):
-        assert_same(reconstruct(scene.frame, config, prior), answer)
+        assert_same(reconstruct(scene.frame, config, prior), answer, ends=ROUNDING)
         assert_same(reconstruct(scene.frame, config.replace(tracking=False), prior), answer)
 
 
@@ -375,7 +376,7 @@ def test_what_was_found_by_then_is_judged(scene, config, answer):
     prior = Prior(previous=answer.shape)
     result = reconstruct(scene.frame, config.replace(min_confidence=1.0), prior, PAST)
     assert result.outcome is Outcome.OUT_OF_TIME and 'by then: ' in result.detail and 0.5 < result.confidence < 1 and None not in result.centerlines
-    assert_same(reconstruct(scene.frame, config.replace(min_confidence=0.5), prior, PAST), answer)
+    assert_same(reconstruct(scene.frame, config.replace(min_confidence=0.5), prior, PAST), answer, ends=ROUNDING)
     assert reconstruct(scene.frame, config.replace(expected_length=(0.1, 0.2)), prior, PAST).outcome is Outcome.LENGTH      # no more time would have helped
 
 
