@@ -8,13 +8,13 @@ from setuptools import find_packages, setup
 NAME = 'fluoro_shape_ros'
 EXECUTABLES = {
     'fluoro_shape_node': 'fluoro_shape_ros.node',
-    'fluoro_shape_sim': 'fluoro_shape_ros.tools.sim',
-    'fluoro_shape_import': 'fluoro_shape_ros.tools.importer',
-    'fluoro_shape_replay': 'fluoro_shape_ros.tools.replay',
-    'fluoro_shape_calibrate': 'fluoro_shape_ros.tools.calibrate',
+    'fluoro_shape_sim': 'fluoro_shape_ros.sim.main',
+    'fluoro_shape_import': 'fluoro_shape_ros.files.importer',
+    'fluoro_shape_replay': 'fluoro_shape_ros.files.replay',
+    'fluoro_shape_calibrate': 'fluoro_shape_ros.files.calibrate',
     'fluoro_shape_bench': 'fluoro_shape_ros.bench.main',
-    'fluoro_shape_demo': 'fluoro_shape_ros.tools.demo',
-    'fluoro_shape_servo_demo': 'fluoro_shape_ros.tools.servo_demo',
+    'fluoro_shape_demo': 'fluoro_shape_ros.demo.main',
+    'fluoro_shape_servo_demo': 'fluoro_shape_ros.demo.servo',
 }
 
 # real ROS 2 Jazzy as wheels; where ROS is installed (or there are no wheels) the extra is empty

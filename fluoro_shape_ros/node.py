@@ -10,8 +10,8 @@ import signal
 import sys
 import threading
 
+from . import cli
 from .config import ConfigError, fields
-from .tools import cli
 
 PROG = 'fluoro_shape_node'
 ROS_PACKAGES = ('rclpy', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_srvs', 'visualization_msgs')
@@ -70,8 +70,8 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.qos_overriding_options import InvalidQosOverridesError
 
-    from .ros_node import FluoroShapeNode
-    from .transforms import TfMissing
+    from .ros.node import FluoroShapeNode
+    from .ros.transforms import TfMissing
     try:
         rclpy.init(args=argv)
         node, executor = FluoroShapeNode(), SingleThreadedExecutor()

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from scipy.special import chdtri
 
-from .geometry.curve import arc_length, at_arc_length
 from .data import Outcome, Reconstruction, Shape, View
 from .geometry.cameras import depth, distort, epipolar_lines, fundamental, project, projection_jacobian, undistort
+from .geometry.curve import arc_length, at_arc_length
 
 SEEN, FOUND, TIP, EPIPOLAR = '#ffb347', '#2ad4ff', '#ff5a5f', '#c58bff'
 GOOD, REJECTED, WORDS = '#5ee07a', '#ffb347', '#ffffff'

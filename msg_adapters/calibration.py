@@ -49,7 +49,7 @@ def read_calibration(path) -> Calibration:
 
 def yaml_mapping(text: str) -> dict:
     """What a YAML text has by name. Raises BadCalibration and ImportError without PyYAML."""
-    import yaml     # the only user of PyYAML among the adapters, which all else does without
+    import yaml  # the only user of PyYAML among the adapters, which all else does without
 
     try:
         content = yaml.safe_load(text)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fluoro_shape_ros.data import Outcome, Reconstruction
-from fluoro_shape_ros.pairing import Counts
+from fluoro_shape_ros.ros.pairing import Counts
 
 from .messages import New, header
 

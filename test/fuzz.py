@@ -14,8 +14,8 @@ from typing import ClassVar
 
 import atheris
 
-with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.tools.dicom', 'fluoro_shape_ros.tools.dicom_header',
-                                         'fluoro_shape_ros.tools.dicom_frames', 'fluoro_shape_ros.tools.dicom_geometry', 'fluoro_shape_ros.tools.dicom_pixels'],
+with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.files.dicom', 'fluoro_shape_ros.files.dicom_header',
+                                         'fluoro_shape_ros.files.dicom_frames', 'fluoro_shape_ros.files.dicom_geometry', 'fluoro_shape_ros.files.dicom_pixels'],
                                 exclude=['pydicom._dicom_dict', 'pydicom._private_dict', 'pydicom._uid_dict', 'pydicom.sr']):
     import numpy as np
     from fuzz_seeds import COMPRESSED, IMAGE, INFO, PATH, TYPES, new, seeds
@@ -24,11 +24,11 @@ with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', '
     from rosbags.typesys.stores import empty
 
     from fluoro_shape_ros.config import Config
-    from fluoro_shape_ros.limits import bounded
-    from fluoro_shape_ros.tools import dicom_pixels
-    from fluoro_shape_ros.tools.dicom import BadDicom, read_run
-    from fluoro_shape_ros.tools.dicom_pixels import pictures
-    from fluoro_shape_ros.worker import checked_camera, decode
+    from fluoro_shape_ros.files import dicom_pixels
+    from fluoro_shape_ros.files.dicom import BadDicom, read_run
+    from fluoro_shape_ros.files.dicom_pixels import pictures
+    from fluoro_shape_ros.ros.message_sizes import bounded
+    from fluoro_shape_ros.ros.worker import checked_camera, decode
     from msg_adapters.bags import BadBag, open_bag
     from msg_adapters.cameras import BadCameraInfo, camera_info_to_view
     from msg_adapters.images import BadImage

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip('hypothesis')
 
-from hypothesis import HealthCheck, settings    # noqa: E402
+from hypothesis import HealthCheck, settings
 
 EXAMPLES = int(os.environ.get('PROPERTY_EXAMPLES', 40))
 

@@ -3,7 +3,7 @@
 import cv2
 from drawing import CALIBRATIONS
 
-from fluoro_shape_ros.tools import replay
+from fluoro_shape_ros.files import replay
 from msg_adapters.bags import create_bag, open_bag
 from msg_adapters.calibration import calibration_to_camera_info
 from msg_adapters.images import array_to_image

@@ -29,8 +29,8 @@ from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 from scipy.special import ellipe
 
-from ..geometry.curve import arc_length, frames
 from ..geometry.cameras import project, projection_jacobian
+from ..geometry.curve import arc_length, frames
 from ..sim.scenes import Run
 
 KNOT_SPACING = 0.010    # m

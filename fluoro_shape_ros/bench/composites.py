@@ -14,12 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..cli import ToolError
 from ..data import Frame, View
-from ..imaging.field import field_of_view
 from ..geometry.cameras import GeometryError, isocenter, make_view
+from ..imaging.field import field_of_view
 from ..sim import placement, xray
 from ..sim.scenes import FRAME_ID, Scene
-from ..tools.cli import ToolError
 
 RADIUS = 0.00045            # m: a guidewire
 LENGTHS = (0.06, 0.13)      # m

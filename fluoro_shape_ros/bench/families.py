@@ -14,11 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..cli import ToolError
 from ..data import Frame
 from ..device import presets
-from ..sim import carm, ct, scenes, variety as wide, xray
+from ..sim import carm, ct, scenes, xray
+from ..sim import variety as wide
 from ..sim.scenes import Run
-from ..tools.cli import ToolError
 from .case import Case, Family
 from .composites import composite
 from .open_scenes import open_family

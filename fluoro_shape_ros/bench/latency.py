@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from .. import cli
+from ..demo.main import child
 from ..sim import scenes
 from ..sim.carm import CArm, biplane
-from ..tools import cli
-from ..tools.demo import child
+from .process_usage import usage
 from .speed import FIELD
-from .usage import usage
 
 SPEED = 0.02            # m/s, of the fastest point of the device
 MOMENT = 1.0            # s of the device's motion at which they begin: it starts from rest
@@ -105,7 +105,7 @@ def first_result(probe, rate: float, process: subprocess.Popen, folder: Path, si
 
 def measure(rate: float, seconds: float, pairs: list[scenes.Scene], tracking: bool = True) -> Row:
     """Stream `rate` of the pairs a second, forth and back, to a node of its own for so many seconds. Raises ToolError where it gives no result."""
-    from .probe import Probe    # needs ROS
+    from .stopwatch import Probe  # needs ROS
     with tempfile.TemporaryDirectory() as name, Probe(pairs) as probe:
         folder, start = Path(name), time.monotonic()
         with timed_node(pairs[0], folder, {'tracking': str(tracking).lower()}) as process:

@@ -11,17 +11,17 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from ..cli import ToolError, count, natural, need, positive, run
 from ..config import fields
+from ..jobs import in_order
 from ..method.judge import judge_of
-from ..tools.cli import ToolError, count, natural, need, positive, run
 from . import judge, latency, memory, prediction, speed, variety
 from .case import Family
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Sources, families, on_real
-from .jobs import in_order
 from .latency import moving_scenes
+from .score import CHI2_95, PICTURES, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempt
 from .table import plain, rows, table
-from .trial import CHI2_95, PICTURES, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempt
 
 DEVICE = 9              # default seed of what moves in front of the node
 METHODS = next(f for f in fields() if f.name == 'method').metadata['choices']
@@ -205,7 +205,7 @@ def _tables(args, parser: argparse.ArgumentParser) -> int:
         args.json.write_text(json.dumps({'command': args.command, 'first_seed': args.first_seed, 'limits': LIMITS, 'rows': plain(found),
                                          'trials': [_plain(t) for t in trials]}, indent=1) + '\n')
     if args.plot:
-        from .plot import draw    # imports matplotlib
+        from .plot import draw  # imports matplotlib
         draw(trials, args.plot)
     return 0
 
@@ -285,7 +285,7 @@ def _variety(args, parser: argparse.ArgumentParser) -> int:
         args.json.write_text(json.dumps({**given, 'limits': variety.LIMITS, 'rows': variety.plain(trials),
                                          'trials': [variety.plain_trial(t) for t in trials]}, indent=1) + '\n')
     if args.plot:
-        from .plot_confidence import draw    # imports matplotlib
+        from .plot_confidence import draw  # imports matplotlib
         draw([a for trial in trials for a in trial.answers.values()], args.plot)
     if args.pictures:
         variety.write_sheets(trials, args.sheets)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from ..cli import ToolError
 from ..sim.scenes import Scene
-from ..tools.cli import ToolError
 from .latency import first_result, timed_node
-from .usage import usage
+from .process_usage import usage
 
 RATE = 30.0             # pairs a second, for which the motion is rendered
 PATIENCE_S = 2.0        # for an answer: a refused pair gets none
@@ -51,7 +51,7 @@ def measure(pairs: int, scenes: list[Scene], everything: bool = False) -> Memory
 
     Raises ToolError where the node gives no result, or ends.
     """
-    from .probe import Probe    # needs ROS
+    from .stopwatch import Probe  # needs ROS
     with tempfile.TemporaryDirectory() as name, Probe(scenes) as probe, timed_node(scenes[0], Path(name)) as process:
         if everything:
             probe.listen_to_everything()

@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..cli import ToolError
 from ..data import Frame
 from ..geometry.cameras import GeometryError, make_view
 from ..sim.scenes import FRAME_ID, Scene
-from ..tools.cli import ToolError
 from .case import Case, Family
 
 TEXT = 'scenes from elsewhere, by name of their folders'

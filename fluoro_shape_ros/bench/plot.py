@@ -9,9 +9,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..files.pictures import FOUND, GRID, MISSED, STYLE, TEXT, TIP, TRUTH
+from .score import WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 from .table import share
-from ..tools.pictures import FOUND, GRID, MISSED, STYLE, TEXT, TIP, TRUTH
-from .trial import WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 
 COLOURS = (FOUND, MISSED, '#b48cff', '#7ee081')     # of methods
 PANELS = (('mean', 'closest point (mm)', WITHIN_MEAN), ('tip', 'tip (mm)', WITHIN_TIP))

@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..tools.pictures import FOUND, STYLE, TEXT, TIP
-from .trial import Answer
+from ..files.pictures import FOUND, STYLE, TEXT, TIP
+from .score import Answer
 
 BINS = np.array([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0])
 

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from ..config import Config
-from ..geometry.curve import arc_length
 from ..data import Prior, Reconstruction
-from ..metrics import compare
+from ..geometry.curve import arc_length
 from ..method.pipeline import reconstruct
+from ..metrics import compare
 from ..sim.kinematics import loaded
 from ..sim.shapes import random_cannula
 from .families import Case, families
-from .trial import Answer, answer_of
+from .score import Answer, answer_of
 
 FAMILIES = ('low_dose', 'faint', 'clutter', 'crossing')
 PUSHED = 0.015              # m, by which tissue pushes the tip aside, at most; at least half of it

@@ -20,12 +20,12 @@ from tqdm import tqdm
 
 from ..config import Config
 from ..data import Prior, Reconstruction
-from ..metrics import compare
 from ..method.pipeline import reconstruct
+from ..metrics import compare
 from ..sim.carm import CArm, biplane
 from ..sim.scenes import Scene, xray_run
 from ..sim.xray import Exposure
-from .trial import WITHIN_MEAN, WITHIN_TIP
+from .score import WITHIN_MEAN, WITHIN_TIP
 
 FIELD = 0.3e-3 * 1024               # m at the isocentre, whatever the number of pixels
 PHOTONS = 1500.0 * 1024**2          # of the whole field

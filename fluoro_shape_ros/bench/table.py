@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .trial import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Trial
+from .score import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 
 ERRORS = {'mean': 'closest point', 'missed': 'and back', 'tip': 'tip', 'length': 'length', 'matched': 'matched'}     # of metrics.Errors: heading
 BOUND = 'bound'

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ..cli import ToolError
 from ..overlay import GOOD, REJECTED, TIP
 from ..sim import ct
-from ..tools.cli import ToolError
 from . import sheets
 from .case import Family
 from .families import Sources, varied
 from .open_scenes import TEXT
+from .score import CHI2_95, RIGHT_MEAN_PX, RIGHT_TIP_PX, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 from .table import share
-from .trial import CHI2_95, RIGHT_MEAN_PX, RIGHT_TIP_PX, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 
 LIMITS = {'right_mean_m': WITHIN_MEAN, 'right_tip_m': WITHIN_TIP, 'right_mean_px': RIGHT_MEAN_PX, 'right_tip_px': RIGHT_TIP_PX,
           'silent_mean_m': SILENT_MEAN, 'silent_tip_m': SILENT_TIP, 'honest_chi2': CHI2_95}

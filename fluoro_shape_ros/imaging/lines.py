@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
 from .ridges import RIDGE_Z, Ridges
 
 BRANCH_Z = 5.0          # standard deviations of the noise by which a branch stands out on average

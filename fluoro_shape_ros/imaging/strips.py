@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..geometry.curve import middle
 from ..data import View
 from ..geometry.cameras import distort
+from ..geometry.curve import middle
 from .parallel import both
 
 TOGETHER = 25           # strips along which a structured background errs the same way

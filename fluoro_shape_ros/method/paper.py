@@ -13,8 +13,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ..config import Config
-from ..geometry.curve import arc_length, at_arc_length
 from ..geometry.cameras import epipolar_lines, fundamental, isocenter, pixels_per_metre, triangulate, undistort
+from ..geometry.curve import arc_length, at_arc_length
 from ..imaging.hessian import eigenvalues, hessian
 
 WIENER_PX = 6
@@ -26,7 +26,7 @@ END_PX = 5.0
 
 def segment(image: np.ndarray, half_width_px: float, min_length_px: float) -> np.ndarray:
     """(N, 2) centreline in px of the largest curve in the (H, W) image of a dark device, or (0, 2) where there is none."""
-    from skimage.morphology import thin     # here: the node's default method needs no scikit-image, and starts faster without
+    from skimage.morphology import thin  # here: the node's default method needs no scikit-image, and starts faster without
     image = image.astype(np.float32)
     filtered = vesselness(wiener(image), [max(1.0, half_width_px * k) for k in SCALES])
     binary = filtered > filtered.mean()             # "thresholded by the mean intensity"

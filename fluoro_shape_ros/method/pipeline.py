@@ -20,15 +20,15 @@ from ..imaging.prepare import dark_device, sheet_of, silhouettes
 from ..imaging.strips import Sheet
 from . import judge, paper
 from .backbone import backbone
-from .checks import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 from .features import MEAN, MEAN_PX, TIP, TIP_PX, at_first_sight, features
 from .fit.fit import Fit, fit
 from .known_device import ALIKE, CONTRADICTS, Likeness, likeness, verdict
-from .near import Near, predicted, tracked
 from .outline import on_outlines
 from .prediction import Guess, borne_out, informed, judged, look
 from .search import Attempt, Search, choose, projected
 from .tip import tip_of
+from .tracking import Near, predicted, tracked
+from .user_bounds import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 CURVE = 400             # points of a fit, that its darkness is looked at along

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from .shapes import STEP, Pose, Section, chain
 
-
 COARSE = 5e-3       # m: arcs are exact, so a backbone in coarse steps has the same tip
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..geometry.curve import arc_length, frames
 from ..device import Device
+from ..geometry.curve import arc_length, frames
 
 SIDES = 64      # of a tube; its cross-section has the circle's area, its width is off by at most 0.08 %
 SAG = 5e-7      # m: how far the chords of a bend may lie inside it

@@ -24,9 +24,9 @@ from msg_adapters.images import array_to_image
 from msg_adapters.messages import ros_message
 from msg_adapters.shapes import shape_to_path, shape_to_tip
 
-from ..geometry.curve import arc_length, at_arc_length
 from ..data import Frame, Shape, View
 from ..geometry.cameras import decompose
+from ..geometry.curve import arc_length, at_arc_length
 from ..resources import resource_path
 from .scenes import Scene
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..geometry.curve import arc_length
 from ..data import View
-from ..device import REST, REFERENCE_KEV, Device, Segment, load_device, presets, water_attenuation
+from ..device import REFERENCE_KEV, REST, Device, Segment, load_device, presets, water_attenuation
 from ..geometry.cameras import make_view, pixels_per_metre, project
+from ..geometry.curve import arc_length
 from . import anatomy as surroundings
 from . import carm, ct, imaging, placement
 from .scenes import Background, Chain, Run, xray_run

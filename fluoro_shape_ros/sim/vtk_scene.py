@@ -12,10 +12,10 @@ import sys
 import cv2
 import numpy as np
 
-from ..geometry.curve import arc_length, at_arc_length
 from ..data import View
 from ..device import Device
 from ..geometry.cameras import decompose
+from ..geometry.curve import arc_length, at_arc_length
 from .carm import shadow_box
 
 SIDES = 32          # of the tube: its mean width is 0.3 % below the circle's
@@ -80,7 +80,7 @@ def _draw(tubes: list[tuple[np.ndarray, float]], K: np.ndarray, size: np.ndarray
     `size` is (w, h) in px of K; the image has SUPERSAMPLING times as many.
     """
     try:
-        import vtkmodules.vtkRenderingOpenGL2   # noqa: F401, before anything is made: it brings the classes that draw
+        import vtkmodules.vtkRenderingOpenGL2  # noqa: F401, before anything is made: it brings the classes that draw
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
         from vtkmodules.vtkRenderingCore import vtkRenderer

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..geometry.curve import arc_length, at_arc_length
 from ..data import View
 from ..device import Device, attenuation
 from ..geometry.cameras import depth, project, source
+from ..geometry.curve import arc_length, at_arc_length
 from .carm import finest_pitch, shadow_box
 
 SUPERSAMPLING = 3

@@ -11,14 +11,14 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from .neighbours import without_neighbours
-from ...geometry.curve import arc_length, middle
-from .ends import BLURS_PX, BRIDGED_PX, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
 from ...geometry.cameras import depth, pixels_per_metre
-from .solver import EndRow, Layout, Solution, solve
+from ...geometry.curve import arc_length, middle
 from ...geometry.spline import Spline3, prolong, through
 from ...imaging.profiles import background, contrast_of, mean_profile, own_shadow, shadow, straight_on
 from ...imaging.strips import Measurement, Model, Sheet, Strips, clutter, cut, darkness_across, half_width_range, measure, search
+from .ends import BLURS_PX, BRIDGED_PX, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
+from .neighbours import without_neighbours
+from .solver import EndRow, Layout, Solution, solve
 
 COARSE, FINE = 2, 3
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for

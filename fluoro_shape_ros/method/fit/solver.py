@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dpbsv
 
-from ...geometry.curve import middle
 from ...geometry.cameras import projection_jacobian
+from ...geometry.curve import middle
 from ...geometry.spline import Spline3, bending
 from ...imaging.strips import Measurement, Strips
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...geometry.curve import arc_length, at_arc_length
 from ...geometry.cameras import epipolar_lines
+from ...geometry.curve import arc_length, at_arc_length
 
 SAMPLES = 64            # points a curve in the alignment
 TOLERANCE_PX = 3.0      # epipolar distance at which a point gains nothing

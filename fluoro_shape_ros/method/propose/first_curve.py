@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-
-from ...geometry.curve import arc_length
-from ...geometry.cameras import depth, isocenter
-from .alignment import Alignment
-from ...geometry.spline import bending
 from scipy.interpolate import BSpline
+
+from ...geometry.cameras import depth, isocenter
+from ...geometry.curve import arc_length
+from ...geometry.spline import bending
+from .alignment import Alignment
 
 ALONG = 0.3             # correspondences along the curve count this much of what is seen across it
 

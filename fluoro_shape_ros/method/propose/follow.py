@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from ...geometry.curve import arc_length, middle
 from ...geometry.cameras import pixels_per_metre
-from .other_lines import darkest_path
-from ..prediction import Guess, in_image
-from ..fit.solver import Layout, solve
+from ...geometry.curve import arc_length, middle
 from ...geometry.spline import through
 from ...imaging.profiles import shadow
 from ...imaging.strips import Measurement, Sheet, Strips, lay_out
+from ..fit.solver import Layout, solve
+from ..prediction import Guess, in_image
+from .other_lines import darkest_path
 
 STEP_PX = 6.0           # between strips ...
 SHIFT_PX = 3            # ... and between shifts, so that a path may turn by 27 degrees from the prediction

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from ..fit.neighbours import APART_PX, dark_along
-from ...geometry.curve import middle
-from ..fit.fit import Fit
 from ...geometry.cameras import pixels_per_metre
-from ..fit.solver import Layout, solve
+from ...geometry.curve import middle
 from ...imaging.strips import Measurement, Sheet, cut
+from ..fit.fit import Fit
+from ..fit.neighbours import APART_PX, dark_along
+from ..fit.solver import Layout, solve
 
 STEP = 3                # px, between the strips
 REACH_PX = 12           # how far to either side another line is looked for

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, median_filter, uniform_filter1d
 
-from ...imaging.ridges import ridge_scale, shrinking
 from ...data import View
 from ...geometry.cameras import depth, distort, isocenter, pixels_per_metre, plane_angle, source
+from ...imaging.ridges import ridge_scale, shrinking
 
 STEP_PX, DEPTH_PX = 3, 1        # of the image made smaller by `shrinking`: between points along the line, and between depths as the other plane shows them
 SLOPES = 9              # depths by which the path may move from point to point: three times as far as along the line

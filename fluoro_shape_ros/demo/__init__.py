@@ -1,0 +1,1 @@
+"""Demonstrations on real topics: one that watches, one that closes its loop."""

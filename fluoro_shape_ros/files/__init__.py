@@ -1,0 +1,1 @@
+"""Files and bags: replay and its report, import, DICOM, calibration."""
