@@ -11,6 +11,7 @@ EXECUTABLES = {
     'fluoro_shape_sim': 'fluoro_shape_ros.sim.main',
     'fluoro_shape_import': 'fluoro_shape_ros.files.importer',
     'fluoro_shape_replay': 'fluoro_shape_ros.files.replay',
+    'fluoro_shape_view': 'fluoro_shape_ros.view.main',
     'fluoro_shape_calibrate': 'fluoro_shape_ros.files.calibrate',
     'fluoro_shape_bench': 'fluoro_shape_ros.bench.main',
     'fluoro_shape_demo': 'fluoro_shape_ros.demo.main',
@@ -28,11 +29,14 @@ EXTRAS = {
     'gvxr': ['gvxr>=2.1' + WHEELS],
     'plot': ['matplotlib>=3.6'],
     'cluster': ['distributed>=2024.2'],
+    'view': ['rerun-sdk>=0.23.1'],     # 0.23.1 is the last release for numpy 1.26
 }
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
+EXTRAS['ros-kilted'] = [name.replace('jazzy', 'kilted') for name in EXTRAS['ros']]     # in place of Jazzy: one venv holds one of them
 # atheris has wheels for these only, and its sources need clang
 EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags'], *EXTRAS['dicom']]
+EXTRAS['docs'] = ['sphinx>=8.0', 'myst-parser>=4.0', 'furo>=2024.8.6', *EXTRAS['bags']]
 EXTRAS['test'] = [*EXTRAS['all'], *EXTRAS['fuzz'], 'pytest>=7.4', 'hypothesis>=6.98']
 
 SHARED = sorted(path for kind in ('xml', 'yaml', 'rviz', 'json', 'html', 'py') for path in glob(f'resource/*.{kind}'))

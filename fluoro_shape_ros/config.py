@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,8 @@ class ConfigError(ValueError):
     """A parameter value that can't work; the message names the parameter and the reason."""
 
 
-def _p(default, description, *, unit='', low=None, high=None, choices=(), element=None):
+def _p(default: Any, description: str, *, unit: str = '', low: float | None = None, high: float | None = None, choices: Sequence[str] = (),
+       element: type | None = None) -> Any:
     """A dataclass field with what people need to know of it. `element` marks a list and gives its type."""
     meta = dict(description=description, unit=unit, low=low, high=high, choices=tuple(choices), element=element)
     return field(default=default, metadata=meta)
@@ -76,7 +79,7 @@ class PlausibilityConfig:
     max_curvature: float = _p(0.0, 'Largest believable curvature of the backbone; 0: the rule of Burgner et al. 2011, eq. 3', unit='1/m', low=0.0, high=1e6)
     max_reprojection_px: float = _p(3.0, 'Largest believable median distance between the reprojected backbone and the centreline seen', unit='px', low=0.1, high=100.0)
     max_tip_sigma: float = _p(0.0, 'Largest standard deviation of the tip in its worst direction; 0: no check', unit='m', low=0.0, high=1.0)
-    min_confidence: float = _p(0.95, 'Least probability of being right that a backbone is published with', low=0.0, high=1.0)
+    min_confidence: float = _p(0.9, 'Least probability of being right that a backbone is published with', low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
@@ -90,14 +93,14 @@ class Config:
     described: Device | None = None     # what the file of `device` says
 
     @classmethod
-    def from_values(cls, **values) -> Config:
+    def from_values(cls, **values: Any) -> Config:
         """The defaults with `values` (parameter name to value) in place of some of them.
 
         Raises ConfigError for an unknown name or a value that can't work.
         """
         return cls().replace(**values)
 
-    def replace(self, **values) -> Config:
+    def replace(self, **values: Any) -> Config:
         """A copy with `values` (parameter name to value) in place of the old ones; raises ConfigError."""
         unknown = set(values) - {f.name for f in fields()}
         if unknown:
@@ -163,7 +166,7 @@ _LISTS = {
 }
 
 
-def _checked(f: dataclasses.Field, value):
+def _checked(f: dataclasses.Field, value: Any) -> Any:
     """`value` in the type of field `f`, or ConfigError with name and reason."""
     m = f.metadata
     if m['element'] is not None:
@@ -189,7 +192,7 @@ def _checked(f: dataclasses.Field, value):
     return value
 
 
-def _number(name: str, value) -> float:
+def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise ConfigError(f'{name}: needs a finite number, got {value!r}')
     return float(value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class Prior:
     masks: tuple[np.ndarray, np.ndarray] | None = None  # (H, W) float32, device-free mean image of each plane
     predicted: np.ndarray | None = None     # (N, 3) a kinematic model's guess, base to tip, m
     prediction_fault: str = ''              # why the newest guess can't be used; empty where it can, or where there is none
-    search: object | None = None            # a method.search.Search of an earlier pair that was cut short, to go on with
+    search: Any = None                      # a method.search.Search of an earlier pair that was cut short, to go on with
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,16 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Landmarks:
+    """Places of the device that each plane shows by itself, undistorted pixels: do they lie on one another's epipolar lines?"""
+
+    kinds: tuple[str, ...]      # N of: tip, base, steps (bands along it), bend (where it runs along its epipolar line)
+    a_px: np.ndarray            # (N, 2)
+    b_px: np.ndarray            # (N, 2)
+    slack_px: np.ndarray        # (N, 2) standard deviation of b_px along the device in plane B, towards its end; 0: a bend
+
+
+@dataclass(frozen=True)
 class Reconstruction:
     """The answer to one pair: a shape exactly when `outcome` is OK, and what was seen in any case."""
 
@@ -126,8 +137,9 @@ class Reconstruction:
     prediction: str = ''                                # agrees, not compared, or ignored and why; empty: there was none
     confidence: float = float('nan')                    # probability that the shape is right; of a rejected pair that of the best curve tried; NaN: none was, or not known
 
-    search: object | None = None                        # a method.search.Search that was cut short
+    search: Any = None                                  # a method.search.Search that was cut short
+    landmarks: Landmarks | None = None                  # of the curve, of a rejected pair too; None: there is none, or the method finds none
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.outcome is Outcome.OK) != (self.shape is not None):
             raise ValueError(f'a {self.outcome.value} reconstruction must {"" if self.shape is None else "not "}have a shape')

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -88,7 +89,7 @@ class Device:
     bands: tuple[Ring, ...] = ()
     disks: tuple[Ring, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.segments:
             raise DeviceError('a device needs at least one segment')
         for k, s in enumerate(self.segments):
@@ -132,7 +133,7 @@ class Device:
     @property
     def widest(self) -> float:
         """Largest radius of any part, m."""
-        return max(part.radius for part in (*self.segments, *self.bands, *self.disks))
+        return max([*(s.radius for s in self.segments), *(r.radius for r in (*self.bands, *self.disks))])
 
     @property
     def length(self) -> float:
@@ -209,19 +210,19 @@ def load_device(name: str | Path) -> Device:
 class _Loader(yaml.SafeLoader):
     """Refuses what can't be meant: a key that is there twice, of which one would be lost, and what takes YAML for ever."""
 
-    def fetch_flow_collection_start(self, kind):
+    def fetch_flow_collection_start(self, kind: Any) -> None:
         if self.flow_level >= DEEPEST:      # the scanner looks at all of them again for each token
             raise yaml.scanner.ScannerError(None, None, 'nested too deep', self.get_mark())
         super().fetch_flow_collection_start(kind)
 
-    def compose_mapping_node(self, anchor):
+    def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         if len(set(keys)) < len(keys):
             raise yaml.composer.ComposerError(None, None, f'{_brief(Counter(keys).most_common(1)[0][0])} is there twice', node.start_mark)
         return node
 
-    def flatten_mapping(self, node):
+    def flatten_mapping(self, node: Any) -> None:
         super().flatten_mapping(node)
         if len(node.value) > LARGEST_MAP:       # in older PyYAML maps that merge others, and these others, grow exponentially
             raise yaml.constructor.ConstructorError(None, None, f'more than {LARGEST_MAP} keys', node.start_mark)
@@ -261,7 +262,7 @@ def _listed(content: dict, name: str) -> list:
     return parts
 
 
-def _part(kind: type, part: object, where: str):
+def _part(kind: Any, part: object, where: str) -> Any:
     """A Segment or Ring from its entry; `attenuation` stands in for `material`."""
     if not isinstance(part, dict):
         raise DeviceError(f'{where}: must be a map such as {{length: 0.01, radius: 0.0006, material: metal}}')
@@ -279,7 +280,7 @@ def _part(kind: type, part: object, where: str):
     return kind(material=material, **values)
 
 
-def _number(value: object, where: str) -> float:
+def _number(value: Any, where: str) -> float:
     try:
         number = math.nan if isinstance(value, bool) else float(value)      # of text too: YAML 1.1 takes 1e-3 for text
     except (TypeError, ValueError, OverflowError):
@@ -305,7 +306,7 @@ def _brief(value: object, most: int = 40) -> str:
     return text if len(text) <= most else f'{text[:most]}...'
 
 
-def _check_material(material: object, where: str) -> None:
+def _check_material(material: Any, where: str) -> None:
     if isinstance(material, str):
         if material not in MATERIALS:
             raise DeviceError(f'{where}: no material is called {_brief(material)}: there are {", ".join(MATERIALS)}, or attenuation in 1/m')

@@ -8,28 +8,31 @@ import os
 import re
 import signal
 import sys
-import threading
 
 from . import cli
 from .config import ConfigError, fields
+from .ros.reconstructor import Reconstructor
 
 PROG = 'fluoro_shape_node'
 ROS_PACKAGES = ('rclpy', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'sensor_msgs', 'std_srvs', 'visualization_msgs')
 STOP_S = 1.0    # for the pair at work when the node is told to end
 SIGNALS = signal.SIGINT, signal.SIGTERM
+HANG_UP = getattr(signal, 'SIGHUP', None)      # Windows has none
 
 
 def main(argv=None) -> int:
-    """Run the node; the exit code: 0 after SIGINT or SIGTERM, 1 without ROS (one line), 2 for unusable arguments (one line)."""
+    """Run the node; the exit code: 0 after SIGINT, SIGTERM or SIGHUP, 1 without ROS (one line), 2 for unusable arguments (one line)."""
     # From rclpy.init on its own handlers end the spinning; Python's must not throw into whatever runs just then.
-    told_to_stop = threading.Event()
+    told_to_stop = []       # by which signals; no threading.Event: its lock would be waited for for ever where one signal comes amid another
     for number in SIGNALS:
-        signal.signal(number, lambda *_: told_to_stop.set())
+        signal.signal(number, lambda number, _: told_to_stop.append(number))
+    if HANG_UP and signal.getsignal(HANG_UP) is not signal.SIG_IGN:     # as nohup has it
+        signal.signal(HANG_UP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))     # of which rclpy knows
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
         return cli.run(lambda _: _run(argv, told_to_stop), _parser(), own_arguments(argv))
     finally:
-        for number in SIGNALS:      # Python gives them their defaults back while it is taken down, and a second one would end it by itself
+        for number in filter(None, (*SIGNALS, HANG_UP)):      # Python gives them their defaults back while it is taken down, and a second one would end it by itself
             signal.signal(number, signal.SIG_IGN)
 
 
@@ -50,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     lines = []
     for f in fields():
         unit = f', {f.metadata["unit"]}' if f.metadata['unit'] else ''
-        default = list(f.default) if f.metadata['element'] else f.default
+        default = list(f.default) if f.metadata['element'] else f.default     # type: ignore[arg-type]
         lines.append(f'  {f.name}: {f.metadata["description"]} (default {default!r}{unit})')
     return argparse.ArgumentParser(
         PROG, usage=f'{PROG} [-h] [--ros-args -p PARAMETER:=VALUE ... -r TOPIC:=OTHER ...]', formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -61,7 +64,12 @@ def _parser() -> argparse.ArgumentParser:
         epilog='parameters:\n' + '\n'.join(lines))
 
 
-def _run(argv: list[str], told_to_stop: threading.Event) -> int:
+def _run(argv: list[str], told_to_stop: list[int]) -> int:
+    with Reconstructor() as reconstructor:      # its process loads what it needs while this one loads ROS, and is begun before there are threads
+        return _run_node(argv, told_to_stop, reconstructor)
+
+
+def _run_node(argv: list[str], told_to_stop: list[int], reconstructor: Reconstructor) -> int:
     for package in ROS_PACKAGES:
         cli.need(package, 'ros')
     import rclpy
@@ -74,7 +82,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     from .ros.transforms import TfMissing
     try:
         rclpy.init(args=argv)
-        node, executor = FluoroShapeNode(), SingleThreadedExecutor()
+        node, executor = FluoroShapeNode(reconstructor), SingleThreadedExecutor()
     except rclpy_implementation.UnknownROSArgsError as error:
         return _refuse(f'unknown ROS arguments {error}')
     except (ConfigError, InvalidQosOverridesError) as error:
@@ -87,7 +95,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
         rclpy.try_shutdown()
         raise cli.ToolError(error) from error
     except RuntimeError as error:   # rclpy has no type of its own for arguments that it can't parse
-        if told_to_stop.is_set() or 'context is invalid' in str(error):     # a signal has shut it down while the node was being made
+        if told_to_stop or 'context is invalid' in str(error):     # a signal has shut it down while the node was being made
             return 0
         rclpy.try_shutdown()
         message = re.sub(r',? at \S+:\d+', '', str(error))     # without places in ROS's sources
@@ -97,7 +105,7 @@ def _run(argv: list[str], told_to_stop: threading.Event) -> int:
     executor.add_node(node)
     gc.freeze()     # what the imports left stays anyway: to look through all of it now and then would hold up a pair for some 50 ms
     try:
-        if not told_to_stop.is_set():   # it may have come before rclpy's handlers
+        if not told_to_stop:    # it may have come before rclpy's handlers
             executor.spin()
     except (ExternalShutdownException, rclpy_implementation.RCLError):
         if rclpy.ok():      # else the signal came between rclpy's look at the context and its use

@@ -14,8 +14,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -41,7 +43,7 @@ class Recorded:
 
     topic: str
     log_ns: int         # when it was recorded; its header says when it was taken
-    message: object
+    message: Any
     raw: bytes          # as it is in the bag (CDR)
 
 
@@ -117,12 +119,12 @@ class BagReader:
     def _raw_messages(self, topics: Collection[str], start_ns: int | None, stop_ns: int | None) -> Iterator[Raw]:
         delivered, count = set(), 0
         connections = [c for c in self._reader.connections if c.topic in topics] if self._reader else []
-        if connections:     # rosbags would take none for all
+        if self._reader and connections:    # rosbags would take none for all
             try:
-                for connection, log_ns, raw in self._reader.messages(connections, start_ns, stop_ns):
+                for connection, log_ns, data in self._reader.messages(connections, start_ns, stop_ns):
                     delivered.add((connection.topic, log_ns))
                     count += 1
-                    yield connection.topic, connection.msgtype, log_ns, plain(bytes(raw))
+                    yield connection.topic, connection.msgtype, log_ns, plain(bytes(data))
                 if count >= self.count(topics) or not self._all_of(start_ns, stop_ns):
                     return
             except Exception as error:  # see open_bag
@@ -143,7 +145,7 @@ class BagReader:
 
 
 @contextmanager
-def open_bag(path) -> Iterator[BagReader]:
+def open_bag(path: str | Path) -> Iterator[BagReader]:
     """The bag at `path`, a rosbag2 directory or one of its .mcap or .db3 files.
 
     A damaged one is opened as far as it can be read, see `BagReader.damage`. Raises BadBag where that is nothing.
@@ -153,7 +155,9 @@ def open_bag(path) -> Iterator[BagReader]:
         raise BadBag(f'{path}: no such bag')
     if path.suffix == '.bag':
         raise BadBag(f'{path}: a bag of ROS 1; convert it with rosbags-convert first')
-    reader, announced, damages = None, {}, []
+    reader: AnyReader | None = None
+    announced: dict[str, int] = {}
+    damages: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         files = [unpacked(file, Path(folder), damages.append) for file in storage_files(path)]
         try:
@@ -216,7 +220,7 @@ def _counted(reader: AnyReader) -> dict[str, tuple[str, int]]:
     return topics
 
 
-def _message(raw: bytes, kind: str, typestore=None):
+def _message(raw: bytes, kind: str, typestore: Any = None) -> Any:
     """A message by our own definition of its type, since those in a bag may be empty, else by that of `typestore`. What is more than it is padding."""
     ours = _jazzy()
     typestore = ours if kind in ours.fielddefs or typestore is None else typestore
@@ -240,7 +244,7 @@ class BagWriter:
     def __init__(self, path: Path, writer: Writer):
         self._path, self._writer = path, writer
         self._typestore = _jazzy()
-        self._connections = {}
+        self._connections: dict[str, Connection] = {}
         self.new = bag_message(self._typestore)     # makes the messages, see messages
 
     def declare(self, topic: str, type_name: str) -> None:
@@ -248,18 +252,18 @@ class BagWriter:
         with _written(self._path):
             self._connections[topic] = self._writer.add_connection(topic, type_name, typestore=self._typestore)
 
-    def write(self, topic: str, message, log_ns: int) -> None:
+    def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message (made with `new`, or read from another bag) to a declared topic. Raises BadBag where there is no room."""
         self.write_raw(topic, self._typestore.serialize_cdr(message, self._connections[topic].msgtype), log_ns)
 
-    def write_raw(self, topic: str, raw: bytes, log_ns: int) -> None:
+    def write_raw(self, topic: str, raw: bytes | memoryview, log_ns: int) -> None:
         """Append a message as another bag has it, see `Recorded.raw`."""
         with _written(self._path):
             self._writer.write(self._connections[topic], log_ns, raw)
 
 
 @contextmanager
-def create_bag(path, storage: str | None = None) -> Iterator[BagWriter]:
+def create_bag(path: str | Path, storage: str | None = None) -> Iterator[BagWriter]:
     """A new rosbag2 directory at `path`; `storage` is mcap or sqlite3, by default what the suffix says (.db3: sqlite3, else mcap).
 
     Nothing is ever overwritten, and nothing stays when it ends in an error. Raises BadBag where `path` exists or can't be written.

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .messages import New, header
 
@@ -33,7 +35,7 @@ _MATRICES = {'K': ('camera_matrix', (3, 3)), 'P': ('projection_matrix', (3, 4)),
              'D': ('distortion_coefficients', None)}
 
 
-def read_calibration(path) -> Calibration:
+def read_calibration(path: str | Path) -> Calibration:
     """The calibration in the file `path`; `calibration_files` reads those of other programs.
 
     `rectification_matrix`, `distortion_model` and `distortion_coefficients` may be missing: none. Whether it can be a camera is for
@@ -71,7 +73,7 @@ def calibration_from(content: dict) -> Calibration:
         raise BadCalibration(f'{error.args[0]} is missing') from None
 
 
-def _matrix(entry, shape: tuple[int, int] | None, name: str) -> np.ndarray:
+def _matrix(entry: Any, shape: tuple[int, int] | None, name: str) -> np.ndarray:
     try:
         values = np.array(entry['data'], float)     # numbers as 1e-05, which YAML 1.1 takes for text, included
     except (TypeError, ValueError, KeyError, IndexError):
@@ -83,17 +85,17 @@ def _matrix(entry, shape: tuple[int, int] | None, name: str) -> np.ndarray:
     return values.reshape(shape)
 
 
-def _size(value, name: str) -> int:
+def _size(value: Any, name: str) -> int:
     if type(value) is not int or value < 1:
         raise BadCalibration(f'{name} must be a positive whole number, not {value!r}')
     return value
 
 
-def write_calibration(path, calibration: Calibration) -> None:
+def write_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write `calibration` to the file `path`, which `read_calibration` and camera_info_manager read."""
     import yaml
 
-    def entry(m):
+    def entry(m: ArrayLike) -> dict[str, object]:
         m = np.atleast_2d(m)
         return {'rows': m.shape[0], 'cols': m.shape[1], 'data': m.ravel().tolist()}
 
@@ -103,7 +105,7 @@ def write_calibration(path, calibration: Calibration) -> None:
     Path(path).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
-def calibration_to_camera_info(calibration: Calibration, stamp_ns: int, frame_id: str, new: New):
+def calibration_to_camera_info(calibration: Calibration, stamp_ns: int, frame_id: str, new: New) -> Any:
     """A sensor_msgs/CameraInfo of the full image; `new` is a factory (see messages)."""
     c = calibration
     return new('sensor_msgs/msg/CameraInfo', header=header(new, stamp_ns, frame_id), width=c.width, height=c.height,

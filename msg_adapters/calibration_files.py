@@ -20,17 +20,18 @@ MAX_SIZE = 10**7        # bytes; no calibration is larger
 FARTHEST = 10.0         # m from the reference frame's origin to a source or camera; larger numbers are millimetres
 
 
-def read_cameras(*paths) -> list[Found]:
+def read_cameras(*paths: str | Path) -> list[Found]:
     """The cameras in a file in order: one, or those of a stereo pair or chain. Of OpenCV's matrices several files together may have them.
 
     Read are camera_info YAML, ROS's ost.txt, XMALab's and Autoscoper's MayaCam 2.0 and VTK cameras, Kalibr's camchain, OpenCV's FileStorage (YAML, XML,
     JSON), and npz and MAT files with OpenCV's matrices or MATLAB's stereoParameters. Raises BadCalibration, OSError where there is no such file,
     and ImportError without PyYAML.
     """
-    path, named = '', {}
+    path: str | Path = ''
+    named: dict[str, object] = {}
     try:
-        for path in map(Path, paths):
-            found = _contents(path)
+        for path in paths:
+            found = _contents(Path(path))
             if isinstance(found, list):
                 if len(paths) > 1:
                     raise BadCalibration('has whole cameras in it, to which no other file adds')

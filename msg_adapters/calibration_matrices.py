@@ -6,9 +6,11 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .calibration import BadCalibration, Calibration
 from .messages import short
@@ -26,7 +28,7 @@ class Found:
     unit: str = ''              # of the lengths in it; '': the file does not say
 
 
-def assembled(name: str, size: tuple[int, int], K, D, model: str, R, t, unit: str = '') -> Found:
+def assembled(name: str, size: tuple[int, int], K: Any, D: ArrayLike, model: str, R: Any, t: Any, unit: str = '') -> Found:
     """A camera from its matrices. Raises BadCalibration where they have another shape."""
     K, R, t = (np.asarray(m, float) for m in (K, R, t))
     if R.size == 3:
@@ -48,7 +50,7 @@ SIDES = (('1', 'l', 'left', 'a', 'cam1', 'camera1'), ('2', 'r', 'right', 'b', 'c
 SIDES_FROM_0 = (('0', 'cam0', 'camera0'), ('1', 'cam1', 'camera1'))
 
 
-def named_cameras(named: dict[str, object]) -> list[Found]:
+def named_cameras(named: dict[str, Any]) -> list[Found]:
     """K and D of one camera, or of two with R and T from the first to the second, whatever their names; alone, R and T take the reference frame to the camera.
 
     Raises BadCalibration where that is not there.
@@ -74,7 +76,7 @@ def named_cameras(named: dict[str, object]) -> list[Found]:
     raise BadCalibration(f'no K, D, R and T of a camera or of a stereo pair; it has {names[:120]}')
 
 
-def _of_side(plain: dict, names: tuple[str, ...], side: tuple[str, ...], default=None):
+def _of_side(plain: dict, names: tuple[str, ...], side: tuple[str, ...], default: Any = None) -> Any:
     """What one of the names means with a side before or after it."""
     return next((plain[key] for name in names for s in side for key in (name + s, s + name) if key in plain), default)
 
@@ -89,7 +91,7 @@ def _size(plain: dict, side: tuple[str, ...]) -> tuple[int, int]:
     return (0, 0) if None in values else (int(np.ravel(values[0])[0]), int(np.ravel(values[1])[0]))
 
 
-def model_of(D, plain: dict | None = None) -> str:
+def model_of(D: ArrayLike, plain: dict | None = None) -> str:
     """The distortion model of OpenCV's coefficients, as the file says or by their number."""
     said = (plain or {}).get('distortionmodel')
     if said is not None:
@@ -109,7 +111,7 @@ def file_storage(path: Path) -> dict[str, object]:
         raise BadCalibration('can\'t be read as OpenCV writes YAML, XML or JSON') from None
 
 
-def _node(node):
+def _node(node: Any) -> Any:
     if node.isInt() or node.isReal():
         return node.real()
     if node.isString():

@@ -15,7 +15,8 @@ NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 
 def mayacam(lines: list[str]) -> Found:
     """MayaCam 2.0: sections 'image size' (width, height), 'camera matrix', 'rotation', 'translation': K, R and t of OpenCV."""
-    sections, name = {}, ''
+    sections: dict[str, list[float]] = {}
+    name = ''
     for line in lines:
         if re.fullmatch('[a-z ]+', line.lower()):
             name = line.lower()
@@ -46,7 +47,7 @@ def vtk_camera(lines: list[str]) -> Found:
     R = np.stack([right, np.cross(forward, right), forward])
     f = size / (2 * np.tan(np.deg2rad(values['view-angle'][0]) / 2))
     K = np.array([[f[0], 0, (size[0] - 1) / 2], [0, f[1], (size[1] - 1) / 2], [0, 0, 1]])
-    return assembled('', tuple(map(int, size)), K, [], '', R, -R @ position)
+    return assembled('', (int(size[0]), int(size[1])), K, [], '', R, -R @ position)
 
 
 # ---- ROS and Kalibr
@@ -54,7 +55,8 @@ def vtk_camera(lines: list[str]) -> Found:
 
 def ost(lines: list[str]) -> list[Found]:
     """ROS's ost.txt (INI): [image] with width and height, then a section a camera with camera matrix, distortion, rectification and projection."""
-    cameras, size, name, key, sections = [], [0, 0], '', '', {}
+    sections: dict[str, dict[str, list[float]]] = {}
+    cameras, name, key = [], '', ''
     for line in lines:
         if line.startswith('#'):
             continue
@@ -66,14 +68,14 @@ def ost(lines: list[str]) -> list[Found]:
             sections.setdefault(name, {})[key] = []
         else:
             sections.setdefault(name, {}).setdefault(key, []).extend(map(float, re.findall(NUMBER, line)))
-    size = [int((sections.get('image', {}).get(key) or [0])[0]) for key in ('width', 'height')]
+    width, height = (int((sections.get('image', {}).get(key) or [0])[0]) for key in ('width', 'height'))
     for name, section in sections.items():
         if 'projection' not in section:
             continue
         parts = {key: section.get(long, []) for key, long in (('K', 'camera matrix'), ('R', 'rectification'), ('P', 'projection'), ('D', 'distortion'))}
         if [len(parts[key]) for key in 'KRP'] != [9, 9, 12]:
             raise BadCalibration(f'[{short(name)}] needs camera matrix, rectification and projection')
-        cameras.append(Found(Calibration(name, *size, np.reshape(parts['K'], (3, 3)), np.reshape(parts['P'], (3, 4)), model_of(parts['D']), np.array(parts['D']),
+        cameras.append(Found(Calibration(name, width, height, np.reshape(parts['K'], (3, 3)), np.reshape(parts['P'], (3, 4)), model_of(parts['D']), np.array(parts['D']),
                                          np.reshape(parts['R'], (3, 3)))))
     if not cameras:
         raise BadCalibration('no camera with a projection in it')
@@ -82,7 +84,8 @@ def ost(lines: list[str]) -> list[Found]:
 
 def kalibr(content: dict) -> list[Found]:
     """Kalibr's camchain: each camera's pose is that of the one before, T_cn_cnm1, m."""
-    cameras, pose = [], np.eye(4)
+    cameras: list[Found] = []
+    pose = np.eye(4)
     while isinstance(camera := content.get(f'cam{len(cameras)}'), dict):
         name = f'cam{len(cameras)}'
         try:

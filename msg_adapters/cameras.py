@@ -5,7 +5,10 @@ Any object with the fields of the message will do: rclpy's and rosbags' messages
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fluoro_shape_ros.data import Distortion, View
 from fluoro_shape_ros.geometry.cameras import GeometryError, decompose, make_view
@@ -24,7 +27,7 @@ class BadCameraInfo(ValueError):
     """A CameraInfo that can't be a camera, or not this image's; the message tells why."""
 
 
-def check_lengths(msg, name: str) -> None:
+def check_lengths(msg: Any, name: str) -> None:
     """Raises BadCameraInfo where what has no limit in plane `name`'s sensor_msgs/CameraInfo is too long to be kept, compared and repeated."""
     if len(msg.header.frame_id) > LONGEST:
         raise BadCameraInfo(f'plane {name}: its frame_id has {len(msg.header.frame_id)} characters, more than {LONGEST}')
@@ -34,7 +37,8 @@ def check_lengths(msg, name: str) -> None:
         raise BadCameraInfo(f'plane {name}: D has {len(msg.d)} coefficients, more than {MOST_COEFFICIENTS}')
 
 
-def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectified: bool = False, pose=None) -> View:
+def camera_info_to_view(msg: Any, name: str, image_shape: tuple[int, int], *, rectified: bool = False,
+                        pose: tuple[np.ndarray, np.ndarray] | None = None) -> View:
     """The View of plane `name` ('a' or 'b') for an image of `image_shape` (H, W) as received, from a sensor_msgs/CameraInfo.
 
     `P` maps the reference frame (m) to pixels; with `pose`, a pair R (3, 3), t (3,) of camera_from_reference, only its left 3x3 counts.
@@ -55,13 +59,13 @@ def camera_info_to_view(msg, name: str, image_shape: tuple[int, int], *, rectifi
         raise BadCameraInfo(str(error)) from error
 
 
-def has_pose(msg) -> bool:
+def has_pose(msg: Any) -> bool:
     """Whether P of a valid sensor_msgs/CameraInfo is not K [I | 0]: it takes points from another frame than the camera's own."""
     _, R, t = decompose(np.reshape(msg.p, (3, 4)).astype(float))
     return bool(np.abs(R - np.eye(3)).max() > NO_POSE or np.abs(t).max() > NO_POSE)
 
 
-def _image_from_full(msg, image_shape: tuple[int, int]) -> np.ndarray:
+def _image_from_full(msg: Any, image_shape: tuple[int, int]) -> np.ndarray:
     """(3, 3) homography from pixels of the full resolution to those of the received image, whose size it checks."""
     full = np.array([msg.width, msg.height], float)
     if not full.all():
@@ -82,7 +86,7 @@ def _image_from_full(msg, image_shape: tuple[int, int]) -> np.ndarray:
                      [0.0, 0.0, 1.0]])
 
 
-def _matrix(values, name: str, shape: tuple[int, int]) -> np.ndarray:
+def _matrix(values: ArrayLike, name: str, shape: tuple[int, int]) -> np.ndarray:
     """An intrinsic or projection matrix from its row-major entries."""
     m = _finite(values, name)
     if m.size != shape[0] * shape[1]:
@@ -102,7 +106,7 @@ def _intrinsics(m: np.ndarray) -> np.ndarray:
     return m
 
 
-def _finite(values, name: str) -> np.ndarray:
+def _finite(values: ArrayLike, name: str) -> np.ndarray:
     m = np.array(values, float)
     if not np.isfinite(m).all():
         raise BadCameraInfo(f'{name} has entries that are not finite')
@@ -111,7 +115,7 @@ def _finite(values, name: str) -> np.ndarray:
     return m
 
 
-def _distortion(msg, K: np.ndarray) -> Distortion | None:
+def _distortion(msg: Any, K: np.ndarray) -> Distortion | None:
     """What `undistort` needs of the raw image with intrinsics `K`, or None where the image is a pinhole's."""
     model, D, R = msg.distortion_model, _finite(msg.d, 'D'), _finite(msg.r, 'R').reshape(3, 3)
     if not R.any():     # never filled in

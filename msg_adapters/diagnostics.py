@@ -11,6 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from fluoro_shape_ros.data import Outcome, Reconstruction
 from fluoro_shape_ros.ros.pairing import Counts
@@ -78,10 +79,13 @@ class ReconstructionSummary:
     warnings: tuple[str, ...] = ()  # of the last pair
     confidence: float = float('nan')    # of the last pair; NaN: not known
     prediction: str = ''            # what became of it for the last pair
+    calibration: str = ''           # what the run says of the calibrations
     notes: tuple[str, ...] = ()     # what else went wrong lately
     silent_s: float | None = None   # since the last pair
     overdue_s: float = 0.0          # for how long the pair at work has been, where that is too long
     overdue: int = 0                # pairs that took too long
+    here: str = ''                  # why pairs are reconstructed in the node itself; empty where that is done in a process of its own ...
+    restarts: int = 0               # ... and how often that was begun anew
     rate_hz: float = 0.0            # of results
     latency_s: tuple[float, ...] = ()       # of the last results: second image's arrival to publication
     outcomes: dict[str, int] = field(default_factory=dict)
@@ -157,7 +161,7 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
         level, message = OK, f'mask: {s.mask}'
     elif s.outcome is None:
         level, message = (WARN, '; '.join(s.notes)) if s.notes else (STALE, 'no pair yet')
-    elif s.silent_s > WINDOW_S:
+    elif s.silent_s is not None and s.silent_s > WINDOW_S:
         level, message = STALE, '; '.join((f'no pair for {s.silent_s:.0f} s; the last one: {reason}', *s.notes))
     elif s.outcome is not Outcome.OK:
         level, message = ERROR if s.outcome in FAULTS else WARN, '; '.join((reason, *notes))
@@ -168,6 +172,7 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
         message += f', {100 * s.out_of_time:.0f} % of the pairs out of time' if s.out_of_time else ''
     values = {'last outcome': last, 'last detail': s.detail, 'confidence': probability(s.confidence), 'warnings': ', '.join(s.warnings),
               'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction, 'overdue pairs': s.overdue, 'out of time (%)': f'{100 * s.out_of_time:.0f}',
+              'calibration_watch': s.calibration, 'process': f'the node itself: {s.here}' if s.here else 'its own', 'reconstruction restarted': s.restarts,
               'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
     return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
 
@@ -185,7 +190,7 @@ def probability(value: float) -> str:
     return '' if value != value else f'{value:.3f}'
 
 
-def diagnostic_array(statuses: list[Status], stamp_ns: int, node_name: str, new: New):
+def diagnostic_array(statuses: list[Status], stamp_ns: int, node_name: str, new: New) -> Any:
     """A diagnostic_msgs/DiagnosticArray; `new` is a factory (see messages)."""
     return new('diagnostic_msgs/msg/DiagnosticArray', header=header(new, stamp_ns, ''), status=[
         new('diagnostic_msgs/msg/DiagnosticStatus', level=s.level, name=f'{node_name}: {s.name}', message=s.message, hardware_id=node_name,
@@ -196,14 +201,14 @@ def diagnostic_array(statuses: list[Status], stamp_ns: int, node_name: str, new:
 class Tally:
     """Counts what happens; may be asked and told from any thread."""
 
-    def __init__(self, clock=time.monotonic):
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
         self._clock, self._lock = clock, threading.Lock()
         self._start = clock()
-        self._counts = Counter()
-        self._events = {}       # name -> times (and values) of the last WINDOW_S
-        self._last = {}         # name -> time of the last one
-        self._reasons = {}      # name -> why the last one was refused
-        self._result = None
+        self._counts: Counter[str] = Counter()
+        self._events: dict[str, deque[tuple[float, float]]] = {}     # name -> times (and values) of the last WINDOW_S
+        self._last: dict[str, float] = {}       # name -> time of the last one
+        self._reasons: dict[str, str] = {}      # name -> why the last one was refused
+        self._result: Reconstruction | None = None
 
     def event(self, name: str, value: float = 0.0) -> None:
         """Something happened, with a number that may belong to it."""
@@ -253,25 +258,26 @@ class Tally:
         with self._lock:
             return bool(self._recent(name, self._clock()))
 
-    def plane(self, plane: str, **known) -> PlaneSummary:
+    def plane(self, plane: str, **known: Any) -> PlaneSummary:
         """The summary of a plane; `known` are the fields that nobody counts."""
         image, camera = f'image {plane}', f'camera info {plane}'
         return PlaneSummary(plane, self.count(image), self.rate_hz(image), self.silent_s(image),
                             bad_images=self.count(f'bad {image}'), image_fault=self.reason(image),
                             bad_camera_infos=self.count(f'bad {camera}'), camera_fault=self.reason(camera), **known)
 
-    def pairing(self, counts: Counts, **known) -> PairingSummary:
+    def pairing(self, counts: Counts, **known: Any) -> PairingSummary:
         return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), dropped_hz=self.rate_hz('dropped'), silent_s=self.silent_s('pair'),
                               both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'),
                               jumped=self.lately('jump'), unpaired_hz=self.rate_hz('unpaired'), **known)
 
-    def reconstruction(self, **known) -> ReconstructionSummary:
+    def reconstruction(self, **known: Any) -> ReconstructionSummary:
         done, good = self._result, f'outcome {Outcome.OK.value}'
         with self._lock:
             latency = tuple(value for _, value in self._recent(good, self._clock()))
             outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
             lately = {name: len(self._recent(f'outcome {name}', self._clock())) for name in outcomes}
-        seen = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, confidence=done.confidence, prediction=done.prediction)
+        seen: dict[str, Any] = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, confidence=done.confidence,
+                                                            prediction=done.prediction)
         return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes,
                                      overdue=self.count('overdue'), out_of_time=lately.get(Outcome.OUT_OF_TIME.value, 0) / max(sum(lately.values()), 1),
                                      refused=self._refused(lately), **seen, **known)
@@ -280,7 +286,7 @@ class Tally:
         """Why most pairs were refused, of the number of each outcome."""
         if not any(lately.values()) or lately.get(Outcome.OK.value):
             return ''
-        usual = max(lately, key=lately.get)
+        usual = max(lately, key=lambda name: lately[name])
         reason = ': '.join(filter(None, (usual, self.reason(f'outcome {usual}'))))
         return f'none of the last {sum(lately.values())} pairs gave a result, most often for {reason}'
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,7 +57,7 @@ def check_pixels(height: int, width: int) -> None:
         raise BadImage(f'{width}x{height} pixels are more than {MAX_PIXELS}')
 
 
-def image_to_array(msg) -> np.ndarray:
+def image_to_array(msg: Any) -> np.ndarray:
     """(H, W) uint8, uint16 or float32 in native byte order, from a sensor_msgs/Image.
 
     A read-only view of the message's memory where that is possible: one channel, native byte order, aligned.
@@ -78,17 +79,16 @@ def image_to_array(msg) -> np.ndarray:
     if not (rows - 1) * step + width * item <= size <= rows * step:
         raise BadImage(f'data has {size} bytes, but {rows} rows of step {step} need {rows * step}')
     check_pixels(height, width)
-    order = '>' if msg.is_bigendian else '<'
     strides = (step, item, encoding.dtype.itemsize)
     # np.ndarray rather than reshape: a step need not be a multiple of the item size
-    array = np.ndarray((height, width, encoding.channels), encoding.dtype.newbyteorder(order), _bytes(msg.data), strides=strides)
+    array: np.ndarray = np.ndarray((height, width, encoding.channels), encoding.dtype.newbyteorder('>' if msg.is_bigendian else '<'), _bytes(msg.data), strides=strides)
     array = np.require(array, encoding.dtype, 'A')      # to native order and alignment, a copy only where they differ
     if encoding.to_grey is not None:
         return cv2.cvtColor(np.ascontiguousarray(array), encoding.to_grey)
     return _checked(array[:, :, 0])
 
 
-def _bytes(data) -> memoryview:
+def _bytes(data: Any) -> memoryview:
     """The buffer of a message's data, read-only and without copying it: array.array, ndarray, bytes and memoryview alike."""
     return np.frombuffer(data, np.uint8).data.toreadonly()
 
@@ -100,7 +100,7 @@ def _checked(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def compressed_to_array(msg) -> np.ndarray:
+def compressed_to_array(msg: Any) -> np.ndarray:
     """(H, W) uint8 or uint16 from a sensor_msgs/CompressedImage that holds a PNG (8 or 16 bits) or a JPEG; colour becomes grey.
 
     The data says what it is; `format` ("png", "mono16; png compressed mono16", ...) is not believed. Raises BadImage for any other data, for
@@ -119,7 +119,7 @@ def compressed_to_array(msg) -> np.ndarray:
     return grey(array)
 
 
-def _name(msg) -> str:
+def _name(msg: Any) -> str:
     return f'the compressed image (format "{short(msg.format)}", {len(msg.data)} bytes)'
 
 
@@ -181,7 +181,7 @@ def grey(array: np.ndarray) -> np.ndarray:
     return _checked(array)
 
 
-def array_to_image(array: np.ndarray, stamp_ns: int, frame_id: str, new: New):
+def array_to_image(array: np.ndarray, stamp_ns: int, frame_id: str, new: New) -> Any:
     """A sensor_msgs/Image of an (H, W) uint8 (mono8), uint16 (mono16) or float32 (32FC1), or an (H, W, 3) uint8 (bgr8) array.
 
     `new` is a factory (see messages). Raises BadImage for any other array.

@@ -6,6 +6,9 @@ nothing of an earlier pair stays in view, and what it sets vanishes by itself af
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
@@ -29,7 +32,7 @@ _SCALE = np.log([5e-5, 2e-4, 1e-3])                             # sigma in m tha
 _COLOURS = np.array([[0.25, 0.85, 0.35], [0.95, 0.85, 0.2], [0.95, 0.2, 0.2]])
 
 
-def shape_to_markers(shape: Shape, robot_radius: float, text: str, stamp_ns: int, frame_id: str, new: New):
+def shape_to_markers(shape: Shape, robot_radius: float, text: str, stamp_ns: int, frame_id: str, new: New) -> Any:
     """MarkerArray of a shape: a tube of `robot_radius` (m) coloured by sigma, the tip, the ellipsoid that holds it with CONFIDENCE, and a text beside it.
 
     Green is a sigma (in the worst direction) of 0.05 mm and less, yellow 0.2 mm, red 1 mm and more, grey unknown. The ellipsoid is
@@ -41,12 +44,12 @@ def shape_to_markers(shape: Shape, robot_radius: float, text: str, stamp_ns: int
     return _array([_tube(shape, robot_radius, new), ball, _ellipsoid(tip, shape.covariance[-1], new), label], stamp_ns, frame_id, new)
 
 
-def rejection_to_markers(text: str, place, stamp_ns: int, frame_id: str, new: New):
+def rejection_to_markers(text: str, place: np.ndarray | None, stamp_ns: int, frame_id: str, new: New) -> Any:
     """MarkerArray that removes the shape shown before and writes why there is none at `place`, (3,) m, or nowhere where that is None."""
     return _array([None, None, None, None if place is None else _words(text, place, new)], stamp_ns, frame_id, new)
 
 
-def _array(markers: list[dict | None], stamp_ns: int, frame_id: str, new: New):
+def _array(markers: list[dict | None], stamp_ns: int, frame_id: str, new: New) -> Any:
     head, lifetime = header(new, stamp_ns, frame_id), new('builtin_interfaces/msg/Duration', sec=LIFETIME_S)
     return new('visualization_msgs/msg/MarkerArray', markers=[
         new('visualization_msgs/msg/Marker', header=head, ns=name, action=_DELETE if fields is None else _ADD, lifetime=lifetime, **(fields or {}))
@@ -100,17 +103,17 @@ def _words(text: str, place: np.ndarray, new: New) -> dict:
     return dict(type=_TEXT, text=text, pose=_pose(place, (0.0, 0.0, 0.0, 1.0), new), scale=_vector([0.0, 0.0, TEXT_HEIGHT], new), color=_colour(_WORDS, new))
 
 
-def _point(p, new: New):
+def _point(p: Sequence[float], new: New) -> Any:
     return new('geometry_msgs/msg/Point', x=p[0], y=p[1], z=p[2])
 
 
-def _pose(p: np.ndarray, q, new: New):
+def _pose(p: np.ndarray, q: Sequence[float], new: New) -> Any:
     return new('geometry_msgs/msg/Pose', position=_point(p.tolist(), new), orientation=new('geometry_msgs/msg/Quaternion', x=q[0], y=q[1], z=q[2], w=q[3]))
 
 
-def _vector(v, new: New):
+def _vector(v: Sequence[float], new: New) -> Any:
     return new('geometry_msgs/msg/Vector3', x=v[0], y=v[1], z=v[2])
 
 
-def _colour(c, new: New):
+def _colour(c: Sequence[float], new: New) -> Any:
     return new('std_msgs/msg/ColorRGBA', r=c[0], g=c[1], b=c[2], a=c[3])

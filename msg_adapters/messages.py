@@ -10,30 +10,31 @@ import array
 import functools
 import importlib
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-New = Callable[..., object]     # the type of a factory
+New = Callable[..., Any]        # the type of a factory; a message is of any type that has its fields
 
 _TYPECODES = {'uint8': 'B', 'octet': 'B', 'int8': 'b', 'uint16': 'H', 'int16': 'h', 'uint32': 'I', 'int32': 'i', 'uint64': 'Q', 'int64': 'q',
               'float': 'f', 'double': 'd'}      # of array.array, by the element type's name in ROS interfaces
 
 
-def ros_message(type_name: str, **fields):
+def ros_message(type_name: str, **fields: Any) -> Any:
     """A real ROS message of type 'package/msg/Name'; imports the class when first asked. Raises ImportError where ROS is not installed."""
     cls, kinds = _ros_class(type_name)
     return cls(**{key: _ros_value(kinds[key], value) for key, value in fields.items()})
 
 
 @functools.cache
-def _ros_class(type_name: str) -> tuple[type, dict[str, str]]:
+def _ros_class(type_name: str) -> tuple[Callable[..., Any], dict[str, str]]:
     """The class and the types of its fields by name; a Path asks for the same four hundreds of times."""
     package, _, name = type_name.split('/')
     cls = getattr(importlib.import_module(f'{package}.msg'), name)
     return cls, cls.get_fields_and_field_types()
 
 
-def _ros_value(kind: str, value):
+def _ros_value(kind: str, value: Any) -> Any:
     """`value` as rclpy wants it for a field of type `kind`: it takes arrays at once that have the right type, and checks others one by one."""
     if kind == 'octet':
         return bytes([value])
@@ -47,17 +48,17 @@ def _ros_value(kind: str, value):
     return np.ascontiguousarray(value, _TYPECODES[kind.split('[')[0]]).ravel()
 
 
-def bag_message(typestore) -> New:
+def bag_message(typestore: Any) -> New:
     """A factory of the messages that `typestore` (of rosbags) knows; these dataclasses need every field and numpy arrays."""
 
     @functools.cache
-    def plan(type_name: str):
+    def plan(type_name: str) -> tuple[Callable[..., Any], dict[str, Any], dict[str, np.dtype]]:
         """The class, its fields, and which of them are numeric sequences, of what type; a Path asks for the same four hundreds of times."""
         kinds = dict(typestore.fielddefs[type_name][1])
         numeric = {name: _dtype(detail[0][1][0]) for name, (node, detail) in kinds.items() if node.name in ('ARRAY', 'SEQUENCE') and _is_numeric(detail[0])}
         return typestore.types[type_name], kinds, numeric
 
-    def new(type_name: str, **fields):
+    def new(type_name: str, **fields: Any) -> Any:
         cls, kinds, numeric = plan(type_name)
         if fields.keys() != kinds.keys():
             unknown = fields.keys() - kinds.keys()
@@ -71,7 +72,7 @@ def bag_message(typestore) -> New:
     return new
 
 
-def _is_numeric(kind) -> bool:
+def _is_numeric(kind: Any) -> bool:
     """Whether sequences of this element type are numpy arrays in rosbags."""
     node, detail = kind
     return node.name == 'BASE' and detail[0] != 'string'
@@ -81,7 +82,7 @@ def _dtype(name: str) -> np.dtype:
     return np.dtype({'byte': 'uint8', 'octet': 'uint8', 'char': 'uint8'}.get(name, name))
 
 
-def _bag_default(new: New, kind):
+def _bag_default(new: New, kind: Any) -> Any:
     node, detail = kind
     if node.name == 'NAME':
         return new(detail)
@@ -94,7 +95,7 @@ def _bag_default(new: New, kind):
     return [_bag_default(new, element) for _ in range(length)]
 
 
-def header(new: New, stamp_ns: int, frame_id: str):
+def header(new: New, stamp_ns: int, frame_id: str) -> Any:
     """std_msgs/Header with a stamp in nanoseconds."""
     sec, nanosec = divmod(int(stamp_ns), 10**9)
     return new('std_msgs/msg/Header', stamp=new('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec), frame_id=frame_id)
@@ -106,7 +107,7 @@ def short(text: str, length: int = 40) -> str:
     return text if len(text) <= length else text[:length] + '...'
 
 
-def stamp_ns(msg) -> int:
+def stamp_ns(msg: Any) -> int:
     """The stamp of a message with a header, or of a header, in nanoseconds."""
     stamp = getattr(msg, 'header', msg).stamp
     return stamp.sec * 10**9 + stamp.nanosec

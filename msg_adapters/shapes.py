@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class BadPath(ValueError):
     """A Path that can't be a backbone; the message tells why."""
 
 
-def shape_to_path(shape: Shape, stamp_ns: int, frame_id: str, new: New):
+def shape_to_path(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
     """nav_msgs/Path, base to tip; each orientation turns +x into the tangent towards the tip, with rotation-minimising roll."""
     head = header(new, stamp_ns, frame_id)
     poses = [new('geometry_msgs/msg/PoseStamped', header=head, pose=_pose(p, q, new))
@@ -50,19 +51,19 @@ def shape_to_path_cdr(shape: Shape, stamp_ns: int, frame_id: str) -> bytes:
     return b'\0\1\0\0' + start + rows.tobytes()[len(head):]
 
 
-def shape_to_tip(shape: Shape, stamp_ns: int, frame_id: str, new: New):
+def shape_to_tip(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
     """geometry_msgs/PointStamped of the last backbone point."""
     return new('geometry_msgs/msg/PointStamped', header=header(new, stamp_ns, frame_id), point=_point(shape.tip.tolist(), new))
 
 
-def shape_to_tip_pose(shape: Shape, stamp_ns: int, frame_id: str, new: New):
+def shape_to_tip_pose(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
     """geometry_msgs/PoseWithCovarianceStamped: the last pose of the path, with `tip_covariance`."""
     pose = _pose(shape.tip.tolist(), orientations(shape)[-1].tolist(), new)
     return new('geometry_msgs/msg/PoseWithCovarianceStamped', header=header(new, stamp_ns, frame_id),
                pose=new('geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=tip_covariance(shape)))
 
 
-def shape_to_cloud(shape: Shape, confidence: float, stamp_ns: int, frame_id: str, new: New):
+def shape_to_cloud(shape: Shape, confidence: float, stamp_ns: int, frame_id: str, new: New) -> Any:
     """sensor_msgs/PointCloud2 with the float32 fields x, y, z, s, sigma (m, in the worst direction), residual_a_px, residual_b_px, confidence; NaN: not known.
 
     The confidence is the probability that the shape is right, the same in every point.
@@ -74,7 +75,7 @@ def shape_to_cloud(shape: Shape, confidence: float, stamp_ns: int, frame_id: str
                is_dense=bool(np.isfinite(rows).all()))
 
 
-def path_to_points(msg) -> np.ndarray:
+def path_to_points(msg: Any) -> np.ndarray:
     """(N, 3) positions of a nav_msgs/Path. Raises BadPath for fewer than 2 or more than MAX_POSES poses, and positions that are not finite."""
     if not 2 <= len(msg.poses) <= MAX_POSES:
         raise BadPath(f'a backbone of {len(msg.poses)} poses: it needs 2 to {MAX_POSES}')
@@ -90,7 +91,7 @@ def tangents(shape: Shape) -> np.ndarray:
     """(N, 3) unit tangents towards the tip; +x for a single point."""
     if len(shape.points) < 2:
         return np.tile([1.0, 0.0, 0.0], (len(shape.points), 1))
-    t = np.gradient(shape.points, shape.s, axis=0, edge_order=min(2, len(shape.points) - 1))
+    t = np.gradient(shape.points, shape.s, axis=0, edge_order=2 if len(shape.points) > 2 else 1)
     return t / np.linalg.norm(t, axis=1, keepdims=True)
 
 
@@ -153,9 +154,9 @@ def _worst_sigma(covariance: np.ndarray) -> np.ndarray:
     return np.where(known, np.sqrt(np.maximum(largest, 0.0)), np.nan)
 
 
-def _point(p, new: New):
+def _point(p: list[float], new: New) -> Any:
     return new('geometry_msgs/msg/Point', x=p[0], y=p[1], z=p[2])
 
 
-def _pose(p, q, new: New):
+def _pose(p: list[float], q: list[float], new: New) -> Any:
     return new('geometry_msgs/msg/Pose', position=_point(p, new), orientation=new('geometry_msgs/msg/Quaternion', x=q[0], y=q[1], z=q[2], w=q[3]))

@@ -1,5 +1,6 @@
 """A page in a real headless Chromium: what test_report.py stands on."""
 
+import html
 import json
 import re
 import shutil
@@ -23,16 +24,22 @@ try { answer = await (async () => { %s })(); } catch (error) { problems.push(Str
 const out = document.createElement('pre');
 out.id = 'answer';
 out.textContent = encodeURIComponent(JSON.stringify([answer, problems]));
-document.documentElement.replaceChildren(out);
+top.document.documentElement.replaceChildren(out);
 })();</script>'''
 
 
-def visit(page, script, folder):
-    """What `script` (the body of an async JavaScript function, which may `await until(() => condition)`) returns in `page`, and the page's errors."""
+def visit(page, script, folder, width=None):
+    """What `script` (the body of an async JavaScript function, which may `await until(() => condition)`) returns in `page`, and the page's errors.
+
+    The page is `width` px wide: in a frame, as Chromium's own window has at least 500 px.
+    """
     copy = folder / 'visited.html'
     head, rest = page.read_text(encoding='utf-8').split('<head>', 1)
     body, end = rest.rsplit('</body>', 1)
-    copy.write_text(f'{head}<head>{CATCH}{body}{DRIVE % script}</body>{end}', encoding='utf-8')
+    text = f'{head}<head>{CATCH}{body}{DRIVE % script}</body>{end}'
+    if width is not None:
+        text = f'<body style="margin: 0"><iframe style="border: 0; width: {width}px; height: 900px" srcdoc="{html.escape(text)}"></iframe></body>'
+    copy.write_text(text, encoding='utf-8')
     done = subprocess.run([CHROMIUM, *OPTIONS, f'--user-data-dir={folder / "profile"}', '--dump-dom', copy.as_uri()], capture_output=True, text=True, timeout=240)
     found = re.search(r'<pre id="answer">([^<]*)</pre>', done.stdout)
     assert found, f'no answer ({done.returncode}): {done.stdout[-500:]} {done.stderr[-3000:]}'

@@ -1,5 +1,7 @@
 """What tests share."""
 
+import signal
+
 import pytest
 
 from msg_adapters.messages import bag_message, ros_message
@@ -21,3 +23,12 @@ def this_machine_only():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         yield
+
+
+@pytest.fixture(scope='session', autouse=True)
+def signals_are_heard():
+    """By what the tests start, also where the tests themselves run in the background (Ctrl-C ignored) or under nohup (SIGHUP ignored)."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)

@@ -40,7 +40,7 @@ def seeds(target: str) -> list[bytes]:
     """Bytes that are in order, to begin with."""
     pictures = [PIXELS, PIXELS * np.uint16(999), PIXELS.astype(np.float32), np.dstack([PIXELS] * 3)]
     if target == 'image':
-        return [serialized(array_to_image(p, 1, 'plane', new), IMAGE) for p in pictures]
+        return [*(serialized(array_to_image(p, 1, 'plane', new), IMAGE) for p in pictures), *cameras()]
     if target == 'compressed_image':
         return [cv2.imencode(suffix, p)[1].tobytes() for suffix, p in (('.png', pictures[0]), ('.png', pictures[1]), ('.jpg', pictures[0]), ('.jpg', pictures[3]))]
     if target == 'camera_info':
@@ -50,6 +50,13 @@ def seeds(target: str) -> list[bytes]:
     if target == 'dicom':
         return xa_runs()
     return sqlite_bags() if target == 'bag_db3' else mcap_bags()
+
+
+def cameras() -> list[bytes]:
+    """Images as colour cameras send them: four channels, colour for two pixels at a time, colour below the luminance; big-endian with padded rows."""
+    kinds = [('bgra8', 32, 6), ('yuv422', 16, 6), ('yuv422_yuy2', 16, 6), ('nv12', 8, 9), ('mono16', 18, 6)]    # encoding, step, rows of data
+    return [serialized(new(IMAGE, header=header(new, 1, 'plane'), height=6, width=8, encoding=encoding, is_bigendian=int(encoding == 'mono16'), step=step,
+                           data=np.arange(step * rows, dtype=np.uint8)), IMAGE) for encoding, step, rows in kinds]
 
 
 def sqlite_bags() -> list[bytes]:
@@ -66,14 +73,16 @@ def sqlite_bags() -> list[bytes]:
 
 
 def mcap_bags() -> list[bytes]:
-    """Bags with an index and without, chunks of every compression; no checksums, which would refuse every mutation before it is read."""
-    found = []
-    for options in (*(dict(compression=kind) for kind in CompressionType), dict(use_chunking=False), dict(index_types=IndexType.NONE, use_statistics=False)):
+    """Bags with an index and without, chunks of every compression, without definitions, of ROS 1; no checksums, which would refuse every mutation before it is read."""
+    definition, found = TYPES.generate_msgdef(HEADER, ros_version=2)[0].encode(), []
+    kinds = [*((dict(compression=kind), definition, 'cdr') for kind in CompressionType), (dict(use_chunking=False), definition, 'cdr'),
+             (dict(index_types=IndexType.NONE, use_statistics=False), definition, 'cdr'), (dict(use_chunking=False), b'', 'cdr'), (dict(use_chunking=False), b'', 'ros1')]
+    for options, text, encoding in kinds:
         file = io.BytesIO()
         writer = McapWriter(file, enable_crcs=False, enable_data_crcs=False, **options)
         writer.start('ros2')
-        schema = writer.register_schema(HEADER, 'ros2msg', TYPES.generate_msgdef(HEADER, ros_version=2)[0].encode())
-        channel = writer.register_channel('/header', 'cdr', schema)
+        schema = writer.register_schema(HEADER, 'ros1msg' if encoding == 'ros1' else 'ros2msg', text)
+        channel = writer.register_channel('/header', encoding, schema)
         writer.add_message(channel, 5, serialized(header(new, 1, 'plane'), HEADER), 5)
         writer.finish()
         found.append(file.getvalue())

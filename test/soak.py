@@ -2,11 +2,12 @@
 
 It fails (exit code 1) where the node ends or reports a bug, a result comes after that of a later pair or belongs to none that could have one,
 a result is wrong without saying so (mean error > 1 mm or tip > 2 mm), memory grows, or the number of threads or files does. Seeded: the same
-faults come in the same order.
+faults come in the same order. Now and then (--kills) the process that reconstructs is killed.
 """
 
 import argparse
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import ros_client as ros
+from processes import reconstructing_for
 from ros_client import BASE, Client, NodeProcess, image_msg, info_msg, points
 from scipy.spatial import cKDTree
 from std_srvs.srv import SetBool
@@ -105,6 +107,12 @@ class Soak:
         else:
             self.pair(kind)
 
+    def kill(self):
+        """End the process that reconstructs."""
+        for pid in reconstructing_for(self.node.process.pid):
+            os.kill(pid, signal.SIGKILL)
+            self.counts['killed'] += 1
+
     def call(self, name, request):
         try:
             request()
@@ -129,7 +137,7 @@ class Soak:
 
     def watch(self):
         """Whether the node lives and reports no bug; its diagnostics go no farther."""
-        bugs = [s.message for s in self.client.statuses if 'internal_error' in s.message]
+        bugs = [s.message for s in self.client.statuses if 'internal_error' in s.message and 'reconstruction restarted: it died of SIGKILL' not in s.message]
         if bugs:
             self.failures.append(f'a bug: {bugs[0]}')
         if self.node.process.poll() is not None:
@@ -139,13 +147,12 @@ class Soak:
 
 
 def resources(pid):
-    """Resident memory in MB, threads, open files of a process."""
-    status = Path(f'/proc/{pid}/status').read_text()
-    field = lambda name: int(status.split(f'\n{name}:')[1].split()[0])  # noqa: E731
-    return field('VmRSS') / 1024, field('Threads'), len(os.listdir(f'/proc/{pid}/fd'))
+    """Resident memory in MB of a node and of the process that reconstructs for it; threads and open files of the node."""
+    field = lambda name, pid: int(Path(f'/proc/{pid}/status').read_text().split(f'\n{name}:')[1].split()[0])  # noqa: E731
+    return sum(field('VmRSS', p) for p in (pid, *reconstructing_for(pid))) / 1024, field('Threads', pid), len(os.listdir(f'/proc/{pid}/fd'))
 
 
-def soak(node, client, seconds, rate, share, seed, growth_mb):
+def soak(node, client, seconds, rate, share, seed, growth_mb, kills):
     """Run; the soak and what its memory, threads and files were (before, after)."""
     run = Soak(node, client, np.random.default_rng(seed))
     if not client.connected() or not client.insist(lambda: client.paths, run.good, infos=run.infos()):
@@ -154,7 +161,7 @@ def soak(node, client, seconds, rate, share, seed, growth_mb):
     run.fault('blank')      # what only a search without a device needs is started before anything is counted
     client.until(lambda: False, 2.0)    # by then none of the first ones is under way
     client.paths.clear()
-    start, before, sent = time.monotonic(), None, 0
+    start, before, sent, warm = time.monotonic(), None, 0, min(WARM_UP_S, seconds / 3)
     while time.monotonic() < start + seconds and run.watch():
         if run.rng.random() < share:
             run.fault(FAULTS[int(run.rng.integers(len(FAULTS)))])
@@ -163,8 +170,10 @@ def soak(node, client, seconds, rate, share, seed, growth_mb):
         sent += 1
         client.until(lambda: False, start + sent / rate - time.monotonic())     # no longer than that: pairs must not come in bursts
         run.judge()
-        if before is None and time.monotonic() > start + min(WARM_UP_S, seconds / 3):
+        if before is None and time.monotonic() > start + warm:
             before = resources(node.process.pid)
+        if run.counts['killed'] < kills and time.monotonic() > start + warm + (run.counts['killed'] + 1) * (seconds - warm) / (kills + 1):
+            run.kill()
     client.now_ns += 200 * 10**9
     good = lambda: run.pair() and client.until(lambda: client.now_ns in client.paths, 2.0)      # noqa: E731
     if not any(good() for _ in range(30)):
@@ -183,17 +192,18 @@ def main() -> int:
     parser.add_argument('--rate', type=float, default=30.0, help='pairs a second (default: %(default)s)')
     parser.add_argument('--faults', type=float, default=0.2, help='share of faults among the pairs (default: %(default)s)')
     parser.add_argument('--seed', type=int, default=1, help='default: %(default)s')
+    parser.add_argument('--kills', type=int, default=20, help='of the process that reconstructs, after the warm-up (default: %(default)s)')
     parser.add_argument('--growth', type=float, default=5.0, help='MB by which memory may grow after the warm-up (default: %(default)s)')
     args = parser.parse_args()
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))       # as shipped, three pairs of four are lost on the way
     with tempfile.TemporaryDirectory() as folder, NodeProcess(Path(folder) / 'log.txt', BASE, ros.RADIUS) as node, Client() as client:
-        run, (before, after) = soak(node, client, args.seconds, args.rate, args.faults, args.seed, args.growth)
+        run, (before, after) = soak(node, client, args.seconds, args.rate, args.faults, args.seed, args.growth, args.kills)
         if node.end() != 0 or 'Traceback' in node.log:
             run.failures.append(f'the node ended with {node.process.returncode}: {node.log[-2000:]}')
     faults = {kind: run.counts[kind] for kind in FAULTS}
     print(f'{run.counts["pairs"]} pairs in {args.seconds:g} s, {sum(faults.values())} faults ({", ".join(f"{n} {kind}" for kind, n in faults.items())})')
-    print(f'{run.judged} answers; memory {before[0]:.1f} to {after[0]:.1f} MB, threads {before[1]} to {after[1]}, files {before[2]} to {after[2]}')
+    print(f'{run.counts["killed"]} kills; {run.judged} answers; memory {before[0]:.1f} to {after[0]:.1f} MB, threads {before[1]} to {after[1]}, files {before[2]} to {after[2]}')
     for failure, n in Counter(run.failures).most_common():
         print(f'FAILED {n} times: {failure}')
     print('failed' if run.failures else 'passed')

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import pytest
 
+import fluoro_shape_ros
 from fluoro_shape_ros import resources
 from fluoro_shape_ros.config import constraint, fields
 from fluoro_shape_ros.data import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
+PARAMETERS = ROOT / 'docs' / 'parameters.md'
 PROFILE = 'fastdds_large_images.xml'
 
 
@@ -69,8 +71,16 @@ def test_data_files_exist_and_ros2_run_finds_every_executable():
     assert f'resource/{PROFILE}' in files['share/fluoro_shape_ros']
 
 
-def test_readme_lists_every_parameter_as_it_is():
-    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+def test_the_version_moves_with_the_changelog(manifest):
+    headings = re.findall(r'^(.+)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8'), re.MULTILINE)
+    releases = [re.fullmatch(r'(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)', heading) for heading in headings[headings[0] == 'Forthcoming':]]
+    assert all(releases), headings
+    newest = releases[0][1] if releases else '0.1.0'        # that of the first release, before there is one
+    assert METADATA['version'] == manifest.findtext('version') == fluoro_shape_ros.__version__ == newest
+
+
+def test_the_page_of_parameters_lists_every_one_as_it_is():
+    text = PARAMETERS.read_text(encoding='utf-8')
     shown = text.split('<!-- parameters -->\n')[1].split('<!-- /parameters -->')[0]
     assert shown.strip() == parameter_table(), 'python test/test_package.py writes the table'
 
@@ -80,18 +90,12 @@ def test_the_file_of_defaults_is_true():
 
 
 def test_troubleshooting_names_every_rejection():
-    text = (ROOT / 'README.md').read_text(encoding='utf-8').split('## Troubleshooting\n')[1].split('\n## ')[0]
+    text = (ROOT / 'docs' / 'troubleshooting.md').read_text(encoding='utf-8')
     assert [o.value for o in Outcome if o is not Outcome.OK and f'`{o.value}' not in text] == []
 
 
-def test_what_readme_and_docs_link_to_exists():
-    for page in (ROOT / 'README.md', ROOT / 'docs' / 'connect.md'):
-        targets = re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', page.read_text(encoding='utf-8'))
-        assert targets and [t for t in targets if not (page.parent / t).exists()] == [], page
-
-
 def parameter_table() -> str:
-    """README's table of parameters."""
+    """The table of docs/parameters.md."""
     rows = ['| parameter | default | unit | range | what it is |', '|---|---|---|---|---|']
     for f in fields():
         m = f.metadata
@@ -183,8 +187,7 @@ def test_help_and_nonsense(name):
 
 
 if __name__ == '__main__':
-    readme = ROOT / 'README.md'
-    before, rest = readme.read_text(encoding='utf-8').split('<!-- parameters -->\n')
+    before, rest = PARAMETERS.read_text(encoding='utf-8').split('<!-- parameters -->\n')
     after = rest.split('<!-- /parameters -->')[1]
-    readme.write_text(f'{before}<!-- parameters -->\n{parameter_table()}\n<!-- /parameters -->{after}', encoding='utf-8')
+    PARAMETERS.write_text(f'{before}<!-- parameters -->\n{parameter_table()}\n<!-- /parameters -->{after}', encoding='utf-8')
     (ROOT / 'resource' / 'defaults.yaml').write_text(defaults_file())

@@ -89,8 +89,8 @@ def information(run: Run, i: int, curve: np.ndarray, tangent: np.ndarray, normal
         image = np.zeros(noise.shape, np.float32)
         image[tuple(shadow.T)] = of_parameter
         rows.append((run.blurred(image, i) / noise).ravel())
-    rows = np.array(rows, float)
-    return rows @ rows.T
+    whole = np.array(rows, float)
+    return whole @ whole.T
 
 
 def length_change(s: np.ndarray, tangent: np.ndarray, normals: np.ndarray, basis: np.ndarray) -> np.ndarray:

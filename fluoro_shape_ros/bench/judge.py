@@ -82,7 +82,7 @@ def gather(task: Task) -> Curves:
                     first_sight=lambda points: float(model.log_odds(at_first_sight(points, sheet, scene.radius))))
     search.go_on()
     tried = search.tried
-    px = np.mean([1 / pixels_per_metre(v.P, scene.truth if device else isocenter(frame.views)[None]) for v in frame.views])
+    px = float(np.mean([1 / pixels_per_metre(v.P, scene.truth if device else isocenter(frame.views)[None]) for v in frame.views]))
     right = [device and is_right(t.fit.curve(200)[::1 if t.tip_is_last else -1], scene.truth, px) for t in tried]
     clash = np.zeros((len(tried), len(tried)), bool)
     for k, j in zip(*np.triu_indices(len(tried), 1)):
@@ -131,7 +131,8 @@ def _fitted(scenes: Sequence[Curves]) -> Judge:
 
     bounds = [(None, None)] + [(0, None)] * parts.shape[1]
     w = minimize(loss, np.zeros(1 + parts.shape[1]), jac=True, bounds=bounds, method='L-BFGS-B', options=dict(maxiter=5000, maxfun=10000)).x
-    return Judge(float(w[0]), typical, scale, *np.split(w[1:], 2), 0.0, 1.0)
+    near, far = np.split(w[1:], 2)
+    return Judge(float(w[0]), typical, scale, near, far, 0.0, 1.0)
 
 
 def calibrate(said: Sequence[tuple[float, bool]]) -> tuple[float, float]:

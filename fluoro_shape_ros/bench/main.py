@@ -15,7 +15,7 @@ from ..cli import ToolError, count, natural, need, positive, run
 from ..config import fields
 from ..jobs import in_order
 from ..method.judge import judge_of
-from . import judge, latency, memory, prediction, speed, variety
+from . import calibration_watch, judge, latency, memory, prediction, speed, streams, variety
 from .case import Family
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Sources, families, on_real
@@ -36,6 +36,8 @@ def main(argv=None) -> int:
     robustness.add_argument('--real', type=Path, metavar='DIR', help='real backgrounds for the families real, real_mask and real_blank: '
                             'background_plane_{a,b}.png and calibration.json (K or K_corrected, R, t of plane_a and plane_b)')
     _add_variety(commands)
+    streams.add(commands)
+    calibration_watch.add(commands)
     _add_judge(commands)
     _add_speed(commands)
     _add_latency(commands)

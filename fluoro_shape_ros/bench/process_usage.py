@@ -1,7 +1,8 @@
-"""What another process uses, from Linux's /proc (proc(5))."""
+"""What another process and its children use, from Linux's /proc (proc(5))."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,15 +10,29 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Usage:
-    """Of a process up to now."""
+    """Of processes up to now."""
 
-    cpu_s: float        # all its threads, user and system
+    cpu_s: float        # all their threads, user and system
     resident: int       # bytes
     peak: int           # bytes resident at most
 
 
 def usage(pid: int) -> Usage:
-    """Raises OSError where there is no such process (any more), or no /proc."""
+    """Of a process and its children; memory that they share counts for each. Raises OSError where there is no such process (any more), or no /proc."""
+    uses = [_alone(pid), *_of_children(pid)]
+    return Usage(sum(u.cpu_s for u in uses), sum(u.resident for u in uses), sum(u.peak for u in uses))
+
+
+def _of_children(pid: int) -> list[Usage]:
+    found = []
+    for listed in Path('/proc', str(pid), 'task').glob('*/children'):
+        for child in listed.read_text().split():
+            with contextlib.suppress(OSError):      # it has just ended
+                found.append(usage(int(child)))
+    return found
+
+
+def _alone(pid: int) -> Usage:
     folder = Path('/proc') / str(pid)
     # the command's name in parentheses may hold anything; what follows it begins with field 3
     fields = (folder / 'stat').read_text().rpartition(')')[2].split()

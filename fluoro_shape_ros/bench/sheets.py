@@ -42,7 +42,7 @@ def thumbnail(images: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     return pair
 
 
-def sheet(cells: list[Cell]) -> np.ndarray:
+def sheet(cells: Sequence[Cell]) -> np.ndarray:
     """(H, W, 3) uint8 BGR: up to COLUMNS x ROWS pairs, row by row."""
     w, h = 2 * SIDE + GAP + 2 * MARGIN, SIDE + CAPTION + 2 * MARGIN
     canvas = np.zeros((h * -(-len(cells) // COLUMNS), w * COLUMNS, 3), np.uint8)

@@ -116,7 +116,7 @@ def measure(size: int, count: int, rounds: int, seed: int, compared: int = COMPA
     blank = np.random.default_rng(0).random((1024, 1024), np.float32)
     moments = sequences(size, count, seed)
     full, tracked = Laps(size, SPLINE, count), Laps(size, TRACKED, count)
-    given = {way: [(now, config_of(now), Prior()) for *_, now in moments] for way in (SPLINE, TRACKED)}
+    given: dict[str, list] = {way: [(now, config_of(now), Prior()) for *_, now in moments] for way in (SPLINE, TRACKED)}
     for k, (*earlier, now) in enumerate(moments):
         before, last = (reconstruct(scene.frame, config_of(scene)).shape for scene in earlier)
         given[TRACKED][k] = now, config_of(now), Prior(last, now.frame.stamp_ns - STEP_NS, before, now.frame.stamp_ns - 2 * STEP_NS)

@@ -19,6 +19,7 @@ from .. import cli
 from ..config import fields
 from ..device import load_device, presets
 from ..files import pictures
+from ..view.page import LOOPBACK, PORT, address
 from .score import Score, headline, live_line, summary
 
 FRAME = 'isocenter'
@@ -48,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--device', metavar='NAME|FILE', type=cli.device, help=f'what it looks like, under fluoroscopy: a file, or {", ".join(presets())} (xray only)')
     add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine (xray only); the method `paper` needs it')
     add('--out', type=Path, default=Path('fluoro_shape_demo'), metavar='FOLDER', help='pictures and logs go there')
+    add('--view', action='store_true', help='see it in a browser too: starts fluoro_shape_view --web beside')
     add('--domain', type=int, default=47, metavar='ID', help='ROS_DOMAIN_ID, so that nothing else on this machine is disturbed')
     return parser
 
@@ -55,6 +57,8 @@ def _parser() -> argparse.ArgumentParser:
 def _run(args) -> int:
     for module, extra in (('rclpy', 'ros'), ('nav_msgs', 'ros'), ('matplotlib', 'plot')):
         cli.need(module, extra)
+    if args.view:
+        cli.need('rerun', 'view')
     pictures.clear(args.out)
     os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     from ..sim.publisher import use_large_image_profile
@@ -71,6 +75,8 @@ def _run(args) -> int:
                 watcher.spin(0.05)
                 check_alive(children, args.out)
 
+        if args.view:
+            print(f'fluoro_shape_demo: to be seen at {address(LOOPBACK, PORT)}', flush=True)
         print('fluoro_shape_demo: rendering and connecting ...', flush=True)
         spin(lambda: told.is_set() or watcher.score.start_ns is not None, STARTUP_S)
         if watcher.score.start_ns is None and not told.is_set():
@@ -98,7 +104,8 @@ def commands(args) -> dict[str, list[str]]:
     if args.device:
         sim += ['--device', args.device]
         radius = ['-p', f'robot_radius:={load_device(args.device).radius}']
-    return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}', *radius],
+    view = {'view': ['-m', 'fluoro_shape_ros.view.main', '--web', '--wait', str(STARTUP_S)]} if args.view else {}
+    return view | {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'method:={args.method}', '-p', f'reference_frame:={FRAME}', *radius],
             'sim': ['-m', 'fluoro_shape_ros.sim.main', *sim, *device, '--reference-frame', FRAME]}
 
 

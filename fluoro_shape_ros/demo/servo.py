@@ -1,4 +1,4 @@
-"""fluoro_shape_servo_demo: a simulated continuum robot whose controller sees nothing but `tip`, on real topics."""
+"""fluoro_shape_servo_demo: a simulated continuum robot whose controller sees nothing but `tip_pose`, on real topics."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from .. import cli
-from ..device import load_device, presets
-from ..sim.plant import MODEL_ERROR, ROBOTS, plant
+from ..device import presets
+from ..sim import ct, imaging
+from ..sim.plant import MODEL_ERROR, ROBOTS
 
 TOLERANCE = 0.3e-3      # m, in which the true tip has to end
 
@@ -26,7 +27,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         'fluoro_shape_servo_demo', formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         description='Close the loop: a robot that bends otherwise than its model and is pushed by tissue, two X-ray streams, the node, and a controller '
-                    'that sees only `tip` drive the tip along a square and to targets, four processes on real topics. A mask is captured before the '
+                    'that sees only `tip_pose` drive the tip along a square and to targets, four processes on real topics. A mask is captured before the '
                     'robot comes into the field. Prints the errors of the true tip, the delay of the loop, and by how much the robot misses the targets without it.')
     add = parser.add_argument
     add('--robot', choices=tuple(ROBOTS), default='two_tubes', help='concentric tubes, or a segment bent by tendons')
@@ -37,7 +38,11 @@ def _parser() -> argparse.ArgumentParser:
     add('--blackout', action='store_true', help='halfway along the square, plane B does not show the device for 1 s')
     add('--rate', type=_rate, default=15.0, metavar='HZ', help='pairs a second')
     add('--size', type=cli.count, default=512, metavar='PX', help='of the images, which always show 154 mm')
-    add('--device', metavar='NAME|FILE', type=cli.device, help=f'what the robot looks like under fluoroscopy, instead of a rod: a file, or {", ".join(presets())}')
+    add('--device', metavar='NAME|FILE', type=cli.device, help=f'what the robot looks like, instead of a rod: a file, or {", ".join(presets())}')
+    add('--imaging', choices=[name for name in imaging.SETTINGS if name not in imaging.CIRCULAR], default='fluoroscopy',
+        help='physics and display, with --device or --ct')
+    add('--ct', metavar='FILE', type=_ct,
+        help='a CT instead of ribs and spine, and the robot a rod of metal: a .npz file with hu and spacing_m, or a folder with a DICOM series')
     add('--no-anatomy', action='store_true', help='an even background instead of ribs and spine')
     add('--no-mask', action='store_true', help='no mask is captured before the robot comes into the field')
     add('--out', type=Path, default=Path('fluoro_shape_servo_demo'), metavar='FOLDER', help='the picture and logs go there')
@@ -52,6 +57,15 @@ def _rate(text: str) -> float:
     return value
 
 
+def _ct(text: str) -> str:
+    """The file or folder of a CT, as it is given, once it is known to be one."""
+    try:
+        ct.load_ct(text)
+    except ct.CtError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
+
+
 def _run(args) -> int:
     for module, extra in (('rclpy', 'ros'), ('nav_msgs', 'ros'), ('matplotlib', 'plot')):
         cli.need(module, extra)
@@ -61,14 +75,14 @@ def _run(args) -> int:
     os.environ.update(ROS_DOMAIN_ID=str(args.domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     use_large_image_profile()
     from .servo_plot import draw
+    from .servo_robot import shown
     from .servo_run import run
     print(f'{args.robot}, bends by {100 * MODEL_ERROR:.0f} % otherwise than its model; its tip is pushed aside; {args.rate:g} pairs/s\n{HEADING}', flush=True)
     runs = []
     for k in range(args.runs):
         runs.append(run(args, args.seed + k))
         print(line(runs[-1], args.rate), flush=True)
-    moved = plant(args.robot, args.seed, args.size, not args.no_anatomy, device=load_device(args.device) if args.device else None)
-    print(f'picture     {draw(runs[0], args.out / "servo.png", moved)}', flush=True)
+    print(f'picture     {draw(runs[0], args.out / "servo.png", shown(args, args.seed))}', flush=True)
     missed = sum(r.final.max() > TOLERANCE for r in runs)
     if missed:
         raise cli.ToolError(f'{missed} of {len(runs)} runs ended farther than {TOLERANCE * 1e3:g} mm from a target')

@@ -13,6 +13,7 @@ from ..sim.plant import Plant
 from .servo_run import Run
 
 MISS = '#ffb347'
+ACROSS_A = [0, 2]       # x and z: what plane A's beam runs across
 
 
 def draw(run: Run, file: Path, moved: Plant) -> Path:
@@ -43,18 +44,17 @@ def _seen(axes, run: Run, moved: Plant) -> None:
 
 
 def _path(axes, run: Run) -> None:
-    """Along the square, seen along the robot's base direction; without a square all of the run."""
+    """Along the square, seen as plane A sees it; without a square all of the run."""
     start, stop = run.square or (min(run.record.target), max(run.record.target) + 1)
     for points, style in ((run.record.target, dict(color=MISS, lw=3, label='target')), (run.record.true, dict(color=TRUTH, lw=1.2, label='true tip')),
                           (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=4, label='measured tip'))):
-        x, y = _between(points, start, stop)[:, :2].T * 1e3
-        axes.plot(x, y, **style)
+        axes.plot(*_between(points, start, stop)[:, ACROSS_A].T * 1e3, **style)
     # a single wrong measurement shows in the errors, and need not shrink the path
-    x, y = _between(run.record.true, start, stop)[:, :2].T * 1e3
-    axes.set(xlim=(x.min() - 1.5, x.max() + 1.5), ylim=(y.min() - 1.5, y.max() + 1.5))
-    axes.set(aspect='equal', xlabel='x (mm)', ylabel='y (mm)', title='the tip')
+    x, z = _between(run.record.true, start, stop)[:, ACROSS_A].T * 1e3
+    axes.set(xlim=(x.max() + 1.5, x.min() - 1.5), ylim=(z.min() - 1.5, z.max() + 1.5))     # in plane A's image x runs to the left, z up
+    axes.set(aspect='equal', xlabel='x (mm)', ylabel='z (mm)', title='the tip, as plane A sees it')
     axes.grid(True)
-    axes.legend(loc='center', bbox_to_anchor=(0.62, 0.3), fontsize=8)
+    axes.legend(loc='center', bbox_to_anchor=(0.38, 0.32), fontsize=8)
 
 
 def _errors(axes, run: Run) -> None:

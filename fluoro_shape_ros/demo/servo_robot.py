@@ -20,7 +20,7 @@ from msg_adapters.shapes import shape_to_path
 from .. import cli
 from ..data import Frame
 from ..device import load_device
-from ..sim import plant
+from ..sim import ct, imaging, plant
 from ..sim.kinematics import driven
 from ..sim.publisher import FluoroSim, true_shape, use_large_image_profile
 from ..sim.scenes import FRAME_ID, Scene
@@ -44,6 +44,7 @@ class Robot(OwnNode):
 
     def __init__(self, name: str, rate: float, what: plant.Plant):
         self._name, self._period, self._plant = name, 1 / rate, what
+        self._names = [joint.name for joint in plant.ROBOTS[name].robot.joints]
         self._joints = self._command = plant.ROBOTS[name].start
         self._index, self._answered, self._stamps, self._dark = 0, 0, [time.time_ns()], (0, 0)
         self._inserted = False
@@ -69,8 +70,7 @@ class Robot(OwnNode):
 
     def _publish(self, xray: FluoroSim) -> None:
         now = self._stamps[-1]
-        names = [joint.name for joint in plant.ROBOTS[self._name].robot.joints]
-        self._states.publish(JointState(header=header(ros_message, now, ''), name=names, position=self._joints.tolist()))
+        self._states.publish(JointState(header=header(ros_message, now, ''), name=self._names, position=self._joints.tolist()))
         if self._inserted:
             model = true_shape(plant.predicted(self._name, self._joints))
             self._predictions.publish(shape_to_path(model, now, FRAME_ID, ros_message))
@@ -90,8 +90,10 @@ class Robot(OwnNode):
             self._executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.01)) or 0.005)
 
     def _on_command(self, msg: JointState) -> None:
-        if len(msg.position) == len(self._joints) and np.isfinite(msg.position).all():
-            self._command = np.array(msg.position)
+        named = dict(zip(msg.name, msg.position))
+        command = np.array([named.get(name, np.nan) for name in self._names])
+        if np.isfinite(command).all():
+            self._command = command
 
     def _on_markers(self, msg: MarkerArray) -> None:
         self._answered = max(self._answered, stamp_ns(msg.markers[0]))
@@ -107,12 +109,23 @@ class Robot(OwnNode):
         return response
 
 
+def shown(args, seed: int) -> plant.Plant:
+    """The robot of a seed before the X-ray system that the command line asks for. Raises ToolError where there is none."""
+    device, volume = load_device(args.device) if args.device else None, ct.load_ct(args.ct) if args.ct else None
+    try:
+        return plant.plant(args.robot, seed, args.size, not args.no_anatomy, device=device, volume=volume, chain=imaging.SETTINGS[args.imaging])
+    except ct.CtError as error:
+        raise cli.ToolError(str(error)) from error
+
+
 def main(argv=None) -> int:
     """Be a robot until the process is told to end."""
     own = argparse.ArgumentParser('servo_robot', description='The robot of fluoro_shape_servo_demo.')
     own.add_argument('--robot', choices=tuple(plant.ROBOTS), required=True)
     own.add_argument('--no-anatomy', action='store_true')
     own.add_argument('--device')
+    own.add_argument('--ct')
+    own.add_argument('--imaging', required=True)
     for name, kind in (('--seed', int), ('--rate', float), ('--size', int)):
         own.add_argument(name, type=kind, required=True)
     return cli.run(_run, own, argv)
@@ -120,7 +133,7 @@ def main(argv=None) -> int:
 
 def _run(args) -> int:
     use_large_image_profile()
-    what = plant.plant(args.robot, args.seed, args.size, not args.no_anatomy, device=load_device(args.device) if args.device else None)
+    what = shown(args, args.seed)
     stop = threading.Event()
     with FluoroSim() as xray, Robot(args.robot, args.rate, what) as robot:
         def end(*_) -> None:

@@ -64,7 +64,9 @@ class Run:
 
 def commands(args, seed: int) -> dict[str, list[str]]:
     """The arguments of Python for each process."""
-    robot = ['--robot', args.robot, '--seed', str(seed), '--rate', str(args.rate), '--size', str(args.size), *(['--device', args.device] if args.device else [])]
+    robot = ['--robot', args.robot, '--seed', str(seed), '--rate', str(args.rate), '--size', str(args.size), '--imaging', args.imaging]
+    for name, value in (('--device', args.device), ('--ct', args.ct)):
+        robot += [name, value] if value else []
     device = ['-p', f'device:={args.device}'] if args.device else []
     return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'reference_frame:={FRAME_ID}', *device],
             'robot': ['-m', 'fluoro_shape_ros.demo.servo_robot', *robot, *(['--no-anatomy'] if args.no_anatomy else [])],
@@ -139,6 +141,6 @@ class Course:
 
 
 def _square(centre: np.ndarray, side: float) -> np.ndarray:
-    """(N, 3) m: from the centre to a corner and around, across the robot's base direction z."""
+    """(N, 3) m: from the centre to a corner and around, across plane A's beam (y), so that its image shows a square."""
     corners = np.array([[0, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * side / 2
-    return centre + np.c_[corners, np.zeros(len(corners))]
+    return centre + np.c_[corners[:, 0], np.zeros(len(corners)), corners[:, 1]]

@@ -83,7 +83,7 @@ def _text(path: str) -> str:
     if len(data) > MAX_TABLE:
         raise CalibrationError(f'{path}: larger than any table of beads')
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encodings = ('utf-16',)
+        encodings: tuple[str, ...] = ('utf-16',)
     elif b'\0' in data[:4]:
         encodings = ('utf-16-be',) if data[:1] == b'\0' else ('utf-16-le',)
     else:
@@ -166,7 +166,7 @@ def triangulated_errors(a: Beads, b: Beads, P: list[np.ndarray] | None = None) -
     """
     i, j = common(a, b)
     if P is not None:
-        return np.linalg.norm(triangulate(*P, a.pixels_px[i], b.pixels_px[j]) - a.points[i], axis=1)
+        return np.linalg.norm(triangulate(P[0], P[1], a.pixels_px[i], b.pixels_px[j]) - a.points[i], axis=1)
     errors, fold = np.full(len(i), np.nan), np.arange(len(i)) % FOLDS
     for part in range(min(FOLDS, len(i))):
         out = fold == part
@@ -174,7 +174,7 @@ def triangulated_errors(a: Beads, b: Beads, P: list[np.ndarray] | None = None) -
             fits = [projection_from_points(np.delete(t.points, k[out], axis=0), np.delete(t.pixels_px, k[out], axis=0)) for t, k in ((a, i), (b, j))]
         except CalibrationError:
             continue
-        errors[out] = np.linalg.norm(triangulate(*fits, a.pixels_px[i[out]], b.pixels_px[j[out]]) - a.points[i[out]], axis=1)
+        errors[out] = np.linalg.norm(triangulate(fits[0], fits[1], a.pixels_px[i[out]], b.pixels_px[j[out]]) - a.points[i[out]], axis=1)
     return errors
 
 

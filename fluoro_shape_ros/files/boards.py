@@ -52,7 +52,7 @@ def find_boards(board: Board, files: list[Path]) -> Views:
         for picture in read_images(open_images(file)):
             if picture.dtype != np.uint8:
                 picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
-            sizes.add(picture.shape[::-1])
+            sizes.add((picture.shape[1], picture.shape[0]))
             corners.append(find(picture))
     if len(sizes) != 1:
         raise CalibrationError(f'{files[0]} and others: pictures of one camera have one size, not {" and ".join(f"{w}x{h}" for w, h in sorted(sizes))}')
@@ -135,7 +135,7 @@ def place_second(board: Board, views: tuple[Views, Views], cameras: tuple[Calibr
     rms, *_, R, t, _, _ = cv2.stereoCalibrate(objects, first, second, K1, D1, K2, D2, views[0].size, flags=cv2.CALIB_FIX_INTRINSIC)
     c = cameras[1]
     placed = Calibration(c.camera_name, c.width, c.height, c.K, c.K @ np.c_[R, t], c.distortion_model, c.D)
-    errors = [_board_errors(points, triangulate(cameras[0].P, placed.P, *(_undistorted(px, camera) for px, camera in ((a, cameras[0]), (b, placed)))))
+    errors = [_board_errors(points, triangulate(cameras[0].P, placed.P, _undistorted(a, cameras[0]), _undistorted(b, placed)))
               for points, a, b in zip(objects, first, second)]
     return placed, float(rms) / np.sqrt(2), np.concatenate(errors)
 

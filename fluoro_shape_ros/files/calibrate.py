@@ -123,7 +123,7 @@ def _from_beads(args, names: list[str]) -> tuple[list[Calibration], list[str]]:
         except (CalibrationError, GeometryError) as error:
             raise CalibrationError(f'{path}: {error}') from error
         lines += [f'{name}: {line}' if len(names) > 1 else line for line in report(P, beads.points, beads.pixels_px, size)]
-        cameras.append(Calibration(name, *size, decompose(P)[0], P, 'plumb_bob', np.zeros(5)))
+        cameras.append(Calibration(name, size[0], size[1], decompose(P)[0], P, 'plumb_bob', np.zeros(5)))
     if len(cameras) == 2:
         lines.append(_both(tables, cameras))
     return cameras, lines
@@ -169,10 +169,10 @@ def report(P: np.ndarray, points: np.ndarray, pixels_px: np.ndarray, size: tuple
 def _both(tables: list[Beads], cameras: list[Calibration]) -> str:
     """What the beads that are in both tables say of the planes together. Raises CalibrationError and GeometryError."""
     check_pair(tuple(make_view(p, c.P, c.width, c.height) for p, c in zip(PLANES, cameras)))
-    fitted = triangulated_errors(*tables, [c.P for c in cameras])
+    fitted = triangulated_errors(tables[0], tables[1], [c.P for c in cameras])
     if not fitted.size:
         return 'no bead is in both tables at one position: are both in one reference frame?'
-    left_out = triangulated_errors(*tables)
+    left_out = triangulated_errors(tables[0], tables[1])
     more = f'; {_rms_mm(left_out):.3f} mm rms where they are left out of the fit in turn' if not np.isnan(left_out).any() else ''
     return f'both planes: {len(fitted)} beads triangulated, off by {_rms_mm(fitted):.3f} mm rms, {1e3 * fitted.max():.3f} mm at worst{more}'
 
@@ -186,7 +186,7 @@ def _rms_mm(errors: np.ndarray) -> float:
 
 def _from_pictures(args, names: list[str], pictures: list[list[str]]) -> tuple[list[Calibration], list[str]]:
     """The same from pictures of a board; the reference frame is the optical frame of the first plane."""
-    board = Board(*args.board, args.square * 1e-3, (args.marker or 0) * 1e-3, args.charuco or '')
+    board = Board(args.board[0], args.board[1], args.square * 1e-3, (args.marker or 0) * 1e-3, args.charuco or '')
     views = [find_boards(board, find_files(given)) for given in pictures]
     if len({len(seen.corners) for seen in views}) > 1:
         raise CalibrationError(f'{len(views[0].corners)} pictures of plane A and {len(views[1].corners)} of plane B: they must be taken together, in pairs')

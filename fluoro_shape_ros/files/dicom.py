@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class XaRun:
     count: int                      # of its frames
     times_ns: np.ndarray | None     # (N,) of the frames from the first one on; None: the file does not say
     calibrations: list[Calibration]     # of the frames, the same object where nothing moved; empty where they were not asked for
-    header: object                  # pydicom's dataset of KEYWORDS
+    header: Any                     # pydicom's dataset of KEYWORDS
     notes: tuple[str, ...] = ()     # what a person should know, a line each
 
 

@@ -34,10 +34,9 @@ def pixel_data(path: Path, header) -> tuple[int, int]:
             pydicom.dcmread(file, stop_before_pixels=True, specific_tags=[Tag('Rows')], force=True)
         begin = file.tell()
         element = file.read(8 if syntax.is_implicit_VR else 12)
-    order = 'little' if syntax.is_little_endian else 'big'
     if element[:4] != (PIXEL_DATA if syntax.is_little_endian else PIXEL_DATA[1::-1] + PIXEL_DATA[:1:-1]):
         raise BadDicom(f'{path}: has no pixels')
-    return begin + len(element), int.from_bytes(element[-4:], order)
+    return begin + len(element), int.from_bytes(element[-4:], 'little' if syntax.is_little_endian else 'big')
 
 
 def compressed_pieces(path: Path, header) -> list[Pieces]:

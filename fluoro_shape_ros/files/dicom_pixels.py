@@ -63,7 +63,7 @@ def decoded(run: XaRun) -> Iterator[np.ndarray]:
     with tempfile.TemporaryFile() as said, subprocess.Popen([sys.executable, '-m', DECODER, str(run.path), str(run.count)], stdout=subprocess.PIPE, stderr=said) as child:
         number = 0
         try:
-            while child.stdout.peek(1):
+            while child.stdout.peek(1):     # type: ignore[attr-defined]
                 yield np.lib.format.read_array(SimpleNamespace(read=child.stdout.read), allow_pickle=False)     # see dicom_decoder
                 number += 1
         except (ValueError, EOFError):     # it ended in the middle of a frame
@@ -104,7 +104,7 @@ def stored_values(frame: np.ndarray, header) -> np.ndarray:
     """The unsigned values in the bits from HighBit down; signed ones are raised so that the lowest is 0."""
     bits, dtype = stored_bits(header), np.uint8 if int(header.BitsAllocated) == 8 else np.uint16
     shift = int(header.get('HighBit') or bits - 1) + 1 - bits
-    values = (frame.astype(frame.dtype.newbyteorder('='), copy=False).view(dtype) >> dtype(shift)) & dtype(2**bits - 1)
+    values = (frame.astype(frame.dtype.newbyteorder('='), copy=False).view(dtype) >> dtype(shift)) & dtype(2**bits - 1)     # type: ignore[operator]
     return values ^ dtype(2 ** (bits - 1)) if header.get('PixelRepresentation') else values
 
 

@@ -43,7 +43,7 @@ class History:
         self.rows: list[Row] = []
         self.kept: list[tuple[int, Answer]] = []
         self.worst: tuple[int, Answer] | None = None    # the pair with the largest residual
-        self.unanswered: tuple[int, Answer] | None = None   # the first pair without a result
+        self.refused: dict[str, tuple[int, Answer]] = {}    # by outcome, the first pair without a result
         self._step = 1
 
     def take(self, answer: Answer) -> None:
@@ -53,8 +53,8 @@ class History:
         self.rows.append(row)
         if row.error_px == row.error_px and (self.worst is None or row.error_px > self.rows[self.worst[0]].error_px):
             self.worst = entry
-        if answer.result.shape is None and self.unanswered is None:
-            self.unanswered = entry
+        if answer.result.shape is None:
+            self.refused.setdefault(row.outcome, entry)
         if entry[0] % self._step == 0:
             self.kept.append(entry)
         if len(self.kept) > KEPT:
@@ -62,6 +62,11 @@ class History:
 
     def close(self) -> None:
         """Nothing is left to do."""
+
+    @property
+    def unanswered(self) -> tuple[int, Answer] | None:
+        """The first pair without a result."""
+        return next(iter(self.refused.values()), None)
 
     @property
     def median(self) -> tuple[int, Answer] | None:

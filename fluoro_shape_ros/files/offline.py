@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache
 from operator import itemgetter
+from typing import Any
 
 import cv2
 from tqdm import tqdm
@@ -33,6 +34,7 @@ from ..cli import ToolError
 from ..config import Config
 from ..data import Frame, Outcome, Reconstruction
 from ..method.pipeline import reconstruct
+from ..ros.calibration_watch import CalibrationWatch, Finding
 from ..ros.frame_names import doubts
 from ..ros.pairing import PLANES, Counts, Pairer
 from ..ros.worker import Camera, Job, Lookup, Memory, adapt, camera, checked_camera, decode, image_window, view_of
@@ -68,6 +70,7 @@ class Summary:
     refused: dict[str, str] = field(default_factory=dict)   # plane -> why its last refused camera info was
     frames: dict[str, tuple[str, str]] = field(default_factory=dict)    # plane -> frame_id of an image, and another one of the camera info that held for it
     masked: int = 0                                         # pairs that made the mask
+    calibration: Finding = Finding()                        # what the run says of the calibrations
     bug: str = ''                                           # what went wrong in the first pair that ended in internal_error
 
     def count(self, stamp: int, result: Reconstruction) -> None:
@@ -88,7 +91,7 @@ class Picture:
     stamp_ns: int
     log_ns: int
     pixels: object      # (H, W) array, or the message where it can't be one
-    recorded: object    # of msg_adapters.bags
+    recorded: Any       # of msg_adapters.bags
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class Offline:
         self.summary = Summary()
         self._bag, self._config, self._topics, self._mask_s, self._copy = bag, config, topics, mask_s, copy
         self._span = span_ns(bag, window)
-        self._pairer, self._memory = Pairer(round(config.input.sync_slop * 1e9)), Memory()
+        self._pairer, self._memory, self._watch = Pairer(round(config.input.sync_slop * 1e9)), Memory(), CalibrationWatch()
         self._views = lru_cache(maxsize=8)(view_of)
         self._cameras: dict[str, list[tuple[int, Camera]]] = {}
         self._poses: RecordedPoses | None = None    # with geometry: tf
@@ -135,6 +138,9 @@ class Offline:
             begin = time.perf_counter()
             frame, result = answer(job, self._memory, self._views, self._poses)
             summary.count(job.stamp_ns, result)
+            if frame is not None:
+                self._watch.take(result, frame.views, job.cameras)
+                summary.calibration = self._watch.finding
             summary.warnings.update(doubts(job.config, NO_FRAMES, job.cameras))
             summary.counts = dataclasses.replace(self._pairer.counts)   # as far as it got, should it be interrupted
             yield Answer(job, frame, result, time.perf_counter() - begin, log_ns)

@@ -131,8 +131,8 @@ def _scalar(node):
     if not REAL.fullmatch(text):
         return text
     word = text.lower()
-    number = float.fromhex(word) if 'x' in word else float(word.replace('.inf', 'inf').replace('.nan', 'nan'))
-    return text if math.isinf(number) and 'inf' not in word else number     # too large for a double
+    value = float.fromhex(word) if 'x' in word else float(word.replace('.inf', 'inf').replace('.nan', 'nan'))
+    return text if math.isinf(value) and 'inf' not in word else value     # too large for a double
 
 
 def _assigned(value: str, text: str):

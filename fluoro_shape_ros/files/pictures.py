@@ -118,7 +118,7 @@ def overlay(ax, snapshot: Snapshot, plane: int) -> None:
     ax.text(0.5, 0.98, f'plane {"AB"[plane]}', va='top', fontsize=14, fontweight='bold', **label)
 
 
-def window(points_px: np.ndarray, shape: tuple[int, int]) -> tuple[float, float, float]:
+def window(points_px: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float, float]:
     """Left, top and side (px) of the square around (N, 2) points with a margin, inside the image of `shape` (H, W) where that is large enough."""
     low, high = points_px.min(axis=0), points_px.max(axis=0)
     side = min((high - low).max() + 2 * MARGIN_PX, min(shape))

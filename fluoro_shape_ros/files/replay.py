@@ -10,6 +10,8 @@ import argparse
 import contextlib
 import json
 import math
+import os
+import shlex
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,7 +19,7 @@ from pathlib import Path
 from msg_adapters import shapes
 from msg_adapters.diagnostics import ERROR, FAULTS, OK, WARN, Status, diagnostic_array, probability
 
-from ..cli import ToolError, count, need, run
+from ..cli import ToolError, count, need, positive, run
 from ..config import Config, ConfigError
 from ..data import Outcome
 from ..ros.frame_names import doubts
@@ -43,7 +45,13 @@ INPUTS = tuple(f'plane_{plane}/{what}' for plane in PLANES for what in ('image_r
 def main(argv=None) -> int:
     """The command line."""
     parser = make_parser()
+    parser.set_defaults(command=command_line(parser.prog, sys.argv[1:] if argv is None else argv))
     return run(lambda args: replay(args, parser), parser, argv)
+
+
+def command_line(program: str, argv: list[str]) -> str:
+    """What was typed, for the page; without the name of who did."""
+    return shlex.join((program, *argv)).replace(f'{os.path.expanduser("~")}/', '~/')
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -59,6 +67,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--report', metavar='HTML', help='make a page to look at: what became of the pairs, the tip\'s track, overlays, the backbone in 3-D over time')
     parser.add_argument('--csv', metavar='FILE', help='write a table: a row a backbone point')
     parser.add_argument('--npz', metavar='FILE', help='write NumPy arrays of all backbone points')
+    parser.add_argument('--bundle', metavar='ZIP', help='pack what a report of a fault needs: a part of the bag, parameters, versions, page and outcomes')
+    parser.add_argument('--bundle-seconds', type=positive, default=3.0, metavar='S',
+                        help='so much of the bag, around the first refused or else the worst pair (default: %(default)g)')
     parser.add_argument('--start', type=_seconds, default=0.0, metavar='S', help='skip the first S seconds')
     parser.add_argument('--duration', type=_seconds, default=math.inf, metavar='S', help='stop after S seconds')
     parser.add_argument('--mask', type=_seconds, default=0.0, metavar='S',
@@ -86,7 +97,7 @@ def replay(args, parser: argparse.ArgumentParser) -> int:
     """What the arguments ask for; the exit code."""
     for module in ('rosbags.highlevel', 'mcap.stream_reader', 'yaml'):
         need(module, 'bags')
-    if args.report:
+    if args.report or args.bundle:
         need('plotly.offline', 'report')
     from msg_adapters.bags import BadBag
 
@@ -103,9 +114,11 @@ def replay(args, parser: argparse.ArgumentParser) -> int:
     if args.start + args.duration <= args.mask:
         parser.error('--mask: nothing is left to reconstruct before the end of --duration')
     if len(args.bags) > 1:
+        if args.bundle:
+            parser.error('--bundle: of one bag at a time')
         from .many_bags import replay_all
         return replay_all(args)
-    for path in filter(None, (args.report, args.csv, args.npz, args.json)):
+    for path in filter(None, (args.report, args.csv, args.npz, args.json, args.bundle)):
         if Path(path).exists():
             raise ToolError(f'{path} exists already and is not overwritten')
         if not Path(path).parent.is_dir():
@@ -141,15 +154,15 @@ def _replay(args, config: Config, topics: Topics, names: dict[str, str], parser:
     """The work; the exit code. What was computed is kept when it is interrupted or something fails on the way."""
     from msg_adapters.bags import create_bag, open_bag
 
-    failures, interrupted = [], False
+    failures, interrupted, packed = [], False, ''
     with open_bag(args.bags[0]) as bag, _damage_told(bag):
         check_topics(bag.types(), topics)
         if topics.tf and not bag.types().keys() & topics.tf.keys():
             parser.error(f'geometry: tf needs {" and ".join(topics.tf)}, of which none is in the bag; record them with the images' + (bag.damage and f'; {bag.damage}'))
         with create_bag(args.out, args.storage) as out:
             history = None
-            sinks = [Results(out, names), *(kind(path) for kind, path in ((Table, args.csv), (Arrays, args.npz)) if path)]
-            if args.report:
+            sinks: list = [Results(out, names), *(kind(path) for kind, path in ((Table, args.csv), (Arrays, args.npz)) if path)]
+            if args.report or args.bundle:
                 from .history import History
                 history = History()
                 sinks.append(history)
@@ -160,13 +173,17 @@ def _replay(args, config: Config, topics: Topics, names: dict[str, str], parser:
                 if not offline.summary.outcomes:
                     raise
                 interrupted = True
-        if history is not None:
+        if args.report:
             from .report import write_report
             with _kept(failures):
-                write_report(args.report, history, offline, args.bags[0])
+                write_report(args.report, history, offline, args.bags[0], args.command)
+        if args.bundle and not interrupted:
+            from .bundle import write_bundle
+            with _kept(failures):
+                packed = write_bundle(args.bundle, args.bundle_seconds, bag, config, topics, (args.start, args.duration), args.mask, history)
         damage = bag.damage
     summary = offline.summary
-    print(report(summary, args.out))
+    print('\n'.join(filter(None, (report(summary, args.out), packed))))
     if args.json:
         with _kept(failures), writing(args.json), Path(args.json).open('x', encoding='utf-8') as file:
             json.dump(as_json(summary), file)

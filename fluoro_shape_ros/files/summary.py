@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
 
 from msg_adapters.messages import short
 
@@ -15,7 +16,7 @@ def as_json(summary: Summary) -> dict:
     """The summary for programs."""
     return {'pairs': summary.counts.pairs, 'images': dict(summary.images), 'masked': summary.masked, 'outcomes': dict(summary.outcomes.most_common()),
             'reasons': [{'outcome': outcome, 'why': why, 'pairs': n} for (outcome, why), n in summary.reasons.most_common()],
-            'warnings': dict(summary.warnings.most_common())}
+            'warnings': dict(summary.warnings.most_common()), 'calibration_watch': {**asdict(summary.calibration), 'words': str(summary.calibration)}}
 
 
 def report(summary: Summary, out: str) -> str:
@@ -36,6 +37,7 @@ def report(summary: Summary, out: str) -> str:
         lines.append('images ' + ', '.join(f'{what}: {n}' for what, n in lost.items() if n))
     if c.jumps:
         lines.append(f'stamps jumped back: {c.jumps} times')
+    lines.append(f'calibration watch: {summary.calibration}')
     lines += [f'camera infos refused: {reason}' for _, reason in sorted(summary.refused.items())]
     lines += [f'plane {plane.upper()}: its images are of frame "{short(image)}", its camera info of "{short(info)}": are the calibrations exchanged?'
               for plane, (image, info) in sorted(summary.frames.items())]

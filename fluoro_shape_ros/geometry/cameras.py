@@ -6,11 +6,13 @@ coordinates, u to the right, v down. Nothing here looks at an image.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import rq
 
 from ..data import Distortion, View
@@ -25,7 +27,7 @@ class GeometryError(ValueError):
     """Numbers that can't be a camera, or a pair of cameras that can't see depth; the message says which."""
 
 
-def make_view(name: str, P, width: int, height: int, distortion: Distortion | None = None) -> View:
+def make_view(name: str, P: ArrayLike, width: int, height: int, distortion: Distortion | None = None) -> View:
     """A View of plane `name` from a (3, 4) projection in metres to pixels, scaled so that w is the depth in m.
 
     Raises GeometryError where P can't be a camera.
@@ -108,7 +110,7 @@ def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
     return (P[:2, :3] - (x[..., :2] / x[..., 2:])[..., None] * P[2, :3]) / x[..., 2, None, None]
 
 
-def calibration_covariance(views: tuple[View, View], X: np.ndarray, T: np.ndarray, sigma_px: float | np.ndarray) -> np.ndarray:
+def calibration_covariance(views: Sequence[View], X: np.ndarray, T: np.ndarray, sigma_px: float | np.ndarray) -> np.ndarray:
     """(N, 3, 3) m^2 of (N, 3) points of a curve with (N, 3) tangents that planes displaced by `sigma_px`, one for all or (N,), along u and v cause.
 
     Each plane v shifts the curve by d_v = J_v dX across its projection, and both on average along it:
@@ -132,7 +134,7 @@ def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
     return float(np.sqrt(abs(np.linalg.det(P[:, :3]))) / abs(np.mean(depth(P, X))))     # det K R = f_u f_v, since |P[2, :3]| = 1
 
 
-def isocenter(views: tuple[View, View]) -> np.ndarray:
+def isocenter(views: Sequence[View]) -> np.ndarray:
     """(3,) m, where two planes look: for a biplane system the point nearest to both central rays (through the image centres).
 
     Those of a rectified stereo pair are parallel: it looks at the distance where its images are STEREO_SHIFT apart.

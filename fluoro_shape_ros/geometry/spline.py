@@ -75,7 +75,7 @@ def through(points: np.ndarray, extension: float, smoothing: float = 1e-3) -> Sp
     return Spline3(start, stop, np.linalg.solve(H, B.T @ points))
 
 
-def prolong(spline: Spline3, ends: tuple[bool, bool], by: float) -> tuple[Spline3, float]:
+def prolong(spline: Spline3, ends: tuple[bool, bool] | np.ndarray, by: float) -> tuple[Spline3, float]:
     """The spline going on straight by `by` m at the first and / or last end, and what is to be added to its old arc lengths."""
     s = np.linspace(spline.start, spline.stop, 400)
     points, (first, last) = spline(s), spline(s[[0, -1]], 1)

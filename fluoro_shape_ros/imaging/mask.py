@@ -22,7 +22,7 @@ def subtract(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if max(abs(du), abs(dv)) < STILL_PX:
         moved = mask.copy()
     else:
-        moved = cv2.warpAffine(mask, np.float32([[1, 0, du], [0, 1, dv]]), mask.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        moved = cv2.warpAffine(mask, np.array([[1, 0, du], [0, 1, dv]], np.float32), mask.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     level = float(moved.mean())
     floor = np.float32(max(0.02 * level, 1e-6))     # unexposed: nothing was let through before either
     image += floor

@@ -22,12 +22,13 @@ def along_lines(image: np.ndarray, sigma_px: float, length_px: float) -> np.ndar
     padded = np.pad(image, margin, mode='symmetric')
     shape = tuple(fft.next_fast_len(n) for n in padded.shape)
     spectrum = fft.fft2(padded, s=shape)
-    best = None
+    best: np.ndarray | None = None
     for pair in _spectra(shape, round(100 * sigma_px), round(100 * length_px)):
         both = fft.ifft2(spectrum * pair, overwrite_x=True)     # the image is real and the filters even: one direction is real, the other imaginary
         found = np.maximum(both.real, both.imag)
         best = found if best is None else np.maximum(best, found, out=best)
     h, w = image.shape
+    assert best is not None     # there are directions
     return np.ascontiguousarray(best[margin:margin + h, margin:margin + w])
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 FEW = 2**19     # pixels of both planes that are worked on sooner than handed to a thread
 
 _other = ThreadPoolExecutor(1, 'plane')     # its thread is started when it is first needed
 
 
-def both(work: Callable, *arguments, pixels: int) -> tuple:
+def both(work: Callable, *arguments: Any, pixels: int) -> Any:
     """What `work` gives for plane A and for plane B; each of `arguments` holds one of each. pixels: how many it works on, in all."""
     *others, last = zip(*arguments)
     if pixels <= FEW:

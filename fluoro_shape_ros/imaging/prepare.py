@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
+from ..data import View
 from ..geometry.cameras import crop, distort, isocenter, pixels_per_metre, project
 from .parallel import both
 from .silhouette import outline, shadow
@@ -38,13 +41,14 @@ def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice], 
         np.sqrt(dark_device(image, polarity)[region], out=out)
 
 
-def sheet_of(images, fields, views, polarity: str, regions=(WHOLE, WHOLE)) -> Sheet:
+def sheet_of(images: Sequence[np.ndarray], fields: Sequence[np.ndarray], views: Sequence[View], polarity: str,
+             regions: Sequence[tuple[slice, slice]] = (WHOLE, WHOLE)) -> Sheet:
     """Both planes' images, or a region of each, as the method wants them."""
     parts = [crop(v, *r) for v, r in zip(views, regions)] if regions != (WHOLE, WHOLE) else views
     return Sheet.of(list(zip(images, regions)), [f[r] for f, r in zip(fields, regions)], parts, lambda i, out: stable_noise(i[0], polarity, i[1], out))
 
 
-def silhouettes(images, views, radius: float) -> tuple[tuple, list[np.ndarray], Sheet]:
+def silhouettes(images: Sequence[np.ndarray], views: Sequence[View], radius: float) -> tuple[tuple, list[np.ndarray], Sheet]:
     """Silhouettes of a device of `radius` m as X-ray images of a dark device and their fields, which are all of them; and a sheet of the outlines as they are."""
     widths = [radius * pixels_per_metre(v.P, isocenter(views)[None]) for v in views]
     fields, pixels = [np.full(image.shape, 255, np.uint8) for image in images], sum(image.size for image in images)
@@ -52,7 +56,7 @@ def silhouettes(images, views, radius: float) -> tuple[tuple, list[np.ndarray], 
     return both(shadow, found, widths, pixels=pixels), fields, Sheet.of(found, fields, views)
 
 
-def region_around(view, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:
+def region_around(view: View, points: np.ndarray, margin_px: float = REGION_PX) -> tuple[slice, slice]:
     """Rows and columns of the image within `margin_px` of the projections of (N, 3) points."""
     uv = distort(view, project(view.P, points))
     low = np.clip(np.floor(uv.min(axis=0)) - margin_px, 0, [view.width - 1, view.height - 1]).astype(int)

@@ -65,7 +65,7 @@ def _noise_ratio(sigma: float) -> float:
 
 def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> Ridges:
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
-    second, one, first = np.float32([1, -2, 1]), np.float32([1]), np.float32([-0.5, 0, 0.5])
+    second, one, first = (np.array(k, np.float32) for k in ([1, -2, 1], [1], [-0.5, 0, 0.5]))
     uu = cv2.sepFilter2D(smooth, cv2.CV_32F, second, one)
     vv = cv2.sepFilter2D(smooth, cv2.CV_32F, one, second)
     uv = cv2.sepFilter2D(smooth, cv2.CV_32F, 2 * first, first)              # 2 I_uv

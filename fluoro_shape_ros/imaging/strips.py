@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -36,7 +36,7 @@ class Strips:
     def halves(self) -> Strips:
         """Both halves of the N strips as if planes of their own showed them: (2 V, N / 2), both of plane A, both of plane B."""
         half = (2 * len(self.speed), -1)
-        return Strips(*(a.reshape(*half, *a.shape[2:]) for a in (self.centers_px, self.normals, self.speed, self.profiles)), self.offsets_px,
+        return Strips(*(a.reshape(*half, *a.shape[2:]) for a in (self.centers_px, self.normals, self.speed, self.profiles)), self.offsets_px,   # type: ignore[call-arg]
                       self.inside.reshape(half), self.lit.reshape(half))
 
 
@@ -70,7 +70,8 @@ class Sheet:
     views: Sequence[View]
 
     @classmethod
-    def of(cls, images, fields, views, draw=lambda image, out: np.copyto(out, image)) -> Sheet:
+    def of(cls, images: Sequence, fields: Sequence[np.ndarray], views: Sequence[View],
+           draw: Callable[..., None] = lambda image, out: np.copyto(out, image)) -> Sheet:
         """From V images (of a dark device) and their (H, W) uint8 fields; `draw` writes one to an (H, W) float32 array.
 
         Around each lie MARGIN_PX rows of its own border, exposed nowhere.
@@ -135,7 +136,7 @@ def cut(sheet: Sheet, points: np.ndarray, tangents: np.ndarray, reach_px: float,
     return Strips(centers, normals, speed, profiles, offsets, exposed.all(axis=2), exposed[..., 1])
 
 
-def lay_out(views, points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lay_out(views: Sequence[View], points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres, normals and speed of the strips across the projections of (N, 3) points with (N, 3) tangents dX/ds, see Strips."""
     P = np.stack([v.P for v in views])
     x = points @ P[:, :, :3].transpose(0, 2, 1) + P[:, None, :, 3]

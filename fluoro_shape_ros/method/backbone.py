@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ..data import Shape
+from ..data import Shape, View
 from ..geometry.cameras import calibration_covariance
 from ..geometry.curve import arc_length, even_steps, middle
 from .fit.fit import Fit
@@ -14,7 +16,7 @@ SOME = 12               # points of a backbone at which that is worked out ...
 AROUND = 12             # ... with so many strips around each, that tell whether the device lies beside the curve there
 
 
-def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
+def backbone(f: Fit, views: Sequence[View], forward: bool, step: float) -> Shape:
     """The fitted spline at equal arc-length steps from base to tip, with the covariance of each point.
 
     Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of the end. What the calibration is
@@ -34,7 +36,7 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     near, weights = f.spline.weights(at, 0)
     covariance = np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near]) + _displaced(f, views, points, tangents, at)
     tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
-    sigma = np.hypot(f.end_sigma, f.end_model)[::1 if forward else -1]
+    sigma = f.end_sigma[::1 if forward else -1]
     covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
     known = [np.isfinite(o) for o in f.offset_px.T]
     residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan) if k.any() else np.full(len(at), np.nan)
@@ -42,7 +44,7 @@ def backbone(f: Fit, views, forward: bool, step: float) -> Shape:
     return Shape(points, s, covariance, residuals)
 
 
-def _displaced(f: Fit, views, points: np.ndarray, tangents: np.ndarray, s: np.ndarray) -> np.ndarray:
+def _displaced(f: Fit, views: Sequence[View], points: np.ndarray, tangents: np.ndarray, s: np.ndarray) -> np.ndarray:
     """(N, 3, 3) m^2 that planes displaced by the calibration's errors, or by what the fit leaves over, add to (N, 3) points at (N,) arc lengths.
 
     Between SOME of them it changes evenly.

@@ -46,7 +46,7 @@ class Features:
     tip_aside: float    # darkness of a line beside where it would go on, beyond what places beside it happen to look like
     tip_farther: float  # nats by which both planes show it going on past its tip
     no_tip: float       # 1 where it leaves the field at both ends
-    length: float       # ln px
+    length: float       # ln of the share of an image's diagonal
     hidden: float       # ends that only one plane shows
 
 
@@ -68,7 +68,7 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
         *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
         stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, np.clip((fit.aside[tip] - BY_CHANCE * fit.clutter).max(), 0.0, 2.0),
-        min(fit.farther[tip], FARTHEST), fit.open_end.all(), np.log(count), (fit.alone >= 0).sum()], float)
+        min(fit.farther[tip], FARTHEST), fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
 
 
 def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarray:
@@ -79,7 +79,7 @@ def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarra
     step = SKETCHED_PX / max(scale)
     spline = through(points, 0.0)
     seen, count = _seen(spline, spline.start, spline.stop, step, sheet, radius, round(BLOCK / SKETCHED_PX))
-    known = dict(zip(NAMES, _everywhere(seen)), length=np.log(count * SKETCHED_PX))
+    known = dict(zip(NAMES, _everywhere(seen)), length=np.log(count * SKETCHED_PX / _diagonal_px(sheet)))
     return np.array([known.get(name, np.nan) for name in NAMES])
 
 
@@ -93,6 +93,10 @@ def _seen(spline: Spline3, start: float, stop: float, step: float, sheet: Sheet,
     half = [WIDER * (h + BLUR_PX) for h in expected]
     strips = cut(sheet, points, tangents, float(np.ceil(5.5 * max(half) + 10)), rough=True)
     return [_plane(strips, v, half[v], expected[v], count, block) for v in (0, 1)], count
+
+
+def _diagonal_px(sheet: Sheet) -> float:
+    return float(max(np.hypot(v.width, v.height) for v in sheet.views))
 
 
 def _everywhere(seen: list[dict]) -> tuple[float, ...]:

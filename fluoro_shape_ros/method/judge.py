@@ -96,4 +96,5 @@ def load() -> Judge:
 def judge_of(content: dict) -> Judge:
     """The judge that a file's content describes."""
     terms = [content['features'][name] for name in NAMES]
-    return Judge(content['bias'], *(np.array([t[key] for t in terms]) for key in ('typical', 'scale', 'near', 'far')), content['offset'], content['slope'])
+    typical, scale, near, far = (np.array([t[key] for t in terms]) for key in ('typical', 'scale', 'near', 'far'))
+    return Judge(content['bias'], typical, scale, near, far, content['offset'], content['slope'])

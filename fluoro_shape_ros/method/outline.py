@@ -52,7 +52,7 @@ def _across(outlines: Sheet, f: Fit, radius: float, look: Callable) -> Fit | Non
     margin = min(radius, 0.1 * (f.stop - f.start))      # an end's corners may be missing on one side
     within = (layout.s > f.start + margin) & (layout.s < f.stop - margin)
     strips = _cut(outlines, layout.basis @ f.spline.control, layout.slope @ f.spline.control, radius)
-    half = [middle(w[within]) / 2 for w in _widths(strips)] if np.count_nonzero(within) > FEWEST else [0.0]
+    half = np.array([middle(w[within]) / 2 for w in _widths(strips)] if np.count_nonzero(within) > FEWEST else [0.0])
     if min(half) < 0.5:
         return None
     x, half = strips.offsets_px, np.minimum(half, 0.5 * strips.offsets_px[-1])
@@ -97,14 +97,19 @@ def _ended(outlines: Sheet, f: Fit, radius: float) -> Fit:
     speak = [sum(e.round if e.outline > ROUND_PX else -SURE for e in seen) for seen in ends]
     drawn = all(ends) and sum(speak) > SURE and min(speak) > -SURE      # with a round brush, from end to end of the axis
     at, sigma, alone = np.array([f.start, f.stop]), f.end_sigma.copy(), f.alone.copy()
+    seen_at, seen_sigma = np.full((2, 2, 2), np.nan)
     for k, (seen, outward) in enumerate(zip(ends, (-1, 1))):
         if seen:
             # One round end of two is the device's own; of a single one in sight nobody can tell.
             apex = 0.0 if drawn else None if speak[k] < 2 * SURE else 1.0 if ends[1 - k] else 0.5
             past, sigma[k] = _joint(seen, apex)
+            if len(seen) == 2:
+                by_each = np.array([_joint([e], apex) for e in seen])
+                seen_at[k], seen_sigma[k] = at[k] + outward * by_each[:, 0], by_each[:, 1]
             at[k] += outward * past
             alone[k] = -1 if len(seen) == 2 else alone[k]
-    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma, alone=alone) if at[1] - at[0] > radius else f
+    ended = replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma, alone=alone, seen_at=seen_at, seen_sigma=seen_sigma)
+    return ended if at[1] - at[0] > radius else replace(f, seen_at=None, seen_sigma=None)
 
 
 def _seen(outlines: Sheet, f: Fit, radius: float, k: int) -> list[_Seen]:

@@ -6,6 +6,8 @@ What the paper leaves open is marked "open:". It is kept literal so that everyth
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -13,6 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ..config import Config
+from ..data import View
 from ..geometry.cameras import epipolar_lines, fundamental, isocenter, pixels_per_metre, triangulate, undistort
 from ..geometry.curve import arc_length, at_arc_length
 from ..imaging.hessian import eigenvalues, hessian
@@ -132,7 +135,7 @@ def same_direction(a_px: np.ndarray, b_px: np.ndarray, F: np.ndarray) -> bool:
     return bool(d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0])
 
 
-def reconstruct_curves(views, centerlines_px: tuple[np.ndarray, np.ndarray], spacing_px: float) -> tuple[np.ndarray, np.ndarray]:
+def reconstruct_curves(views: Sequence[View], centerlines_px: tuple[np.ndarray, np.ndarray], spacing_px: float) -> tuple[np.ndarray, np.ndarray]:
     """The two estimates of the space curve, from plane A's control points and from plane B's: (N, 3) and (M, 3) in m, same direction."""
     a, b = (undistort(v, c) for v, c in zip(views, centerlines_px))
     Pa, Pb = (v.P for v in views)
@@ -145,7 +148,7 @@ def reconstruct_curves(views, centerlines_px: tuple[np.ndarray, np.ndarray], spa
     return triangulate(Pa, Pb, from_a[i], in_b), triangulate(Pa, Pb, in_a, from_b[j])
 
 
-def half_width_px(views, config: Config) -> list[float]:
+def half_width_px(views: Sequence[View], config: Config) -> list[float]:
     """The device's half width in each image, at the isocentre."""
     center = isocenter(views)[None]
     return [config.radius * pixels_per_metre(v.P, center) for v in views]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 
 from ..config import Config
-from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape
+from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape, View
 from ..geometry.cameras import GeometryError, check, distort, pixels_per_metre, project, undistort
 from ..geometry.curve import arc_length, distance_to, resample
 from ..imaging.field import border_distance, field_of_view
@@ -23,6 +23,7 @@ from .backbone import backbone
 from .features import MEAN, MEAN_PX, TIP, TIP_PX, at_first_sight, features
 from .fit.fit import Fit, fit
 from .known_device import ALIKE, CONTRADICTS, Likeness, likeness, verdict
+from .landmarks import landmarks
 from .outline import on_outlines
 from .prediction import Guess, borne_out, informed, judged, look
 from .search import Attempt, Search, choose, projected
@@ -45,7 +46,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: flo
         check(frame.views, config.radius)
     except GeometryError as error:
         return Reconstruction(Outcome.BAD_GEOMETRY, str(error))
-    by = _by_paper if config.curve.method == 'paper' else _by_spline
+    by: Callable[..., Reconstruction] = _by_paper if config.curve.method == 'paper' else _by_spline
     if config.detection.image_kind == 'silhouette':
         images, fields, outlines = silhouettes(frame.images, frame.views, config.radius)
         config = config.replace(polarity='dark')
@@ -58,7 +59,8 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: flo
     return judged(_in_time(by(frame, images, fields, config, prior, guess, clock), clock), guess, why)
 
 
-def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch, measured=lambda f: f) -> Reconstruction:
+def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch,
+               measured: Callable[[Fit], Fit] = lambda f: f) -> Reconstruction:
     """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images.
 
     measured: what is made of a Fit before it is judged.
@@ -76,7 +78,8 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
         predicted = judge.PREDICTED if guess is not None and borne_out(f.curve(100), guess) else 0.0
         return seen, float(model.log_odds(seen)) + predicted + verdict(config.described, alike, f, last)[0], last
 
-    leads, chosen, lines, unfinished = [], None, (), None
+    lines: Sequence[np.ndarray | None] = ()
+    leads, chosen, unfinished = [], None, None
     for n in _near(frame, images, fields, config, prior, guess, clock):
         f = measured(n.fit)
         attempt = Attempt(f, (None, None), *sized_up(n.sheet, f))
@@ -114,15 +117,16 @@ def _by_spline(frame: Frame, images, fields, config: Config, prior: Prior, guess
         words = model.why(chosen.features, chosen.log_odds, p)
     if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)
-    shape = backbone(f, frame.views, last, config.curve.backbone_spacing)
+    shape, places = backbone(f, frame.views, last, config.curve.backbone_spacing), landmarks(f, frame.views, last)
     clock.lap('backbone')
     doubt = (Outcome.LOW_CONFIDENCE, words) if confidence < least else _doubt(shape, config, frame)
     if doubt:
-        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence, search=unfinished)
-    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence)
+        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence, search=unfinished, landmarks=places)
+    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence, landmarks=places)
 
 
-def _near(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Iterator[Near]:
+def _near(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None,
+          clock: _Stopwatch) -> Iterator[Near]:
     """The device where it was, or should be by now, then where a prediction has it."""
     here = frame, images, fields, config.detection.polarity, config.radius
     if config.curve.tracking and prior.previous is not None:
@@ -145,7 +149,7 @@ def _in_time(result: Reconstruction, clock: _Stopwatch) -> Reconstruction:
     return replace(result, outcome=Outcome.OUT_OF_TIME, detail=found)
 
 
-def _nothing(lines, config: Config, clock: _Stopwatch) -> Reconstruction:
+def _nothing(lines: Sequence[np.ndarray | None], config: Config, clock: _Stopwatch) -> Reconstruction:
     """The answer where no curve was found that both planes show."""
     seen = tuple(None if px is None else Centerline(px) for px in lines)
     for px, outcome in zip(lines, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
@@ -154,7 +158,8 @@ def _nothing(lines, config: Config, clock: _Stopwatch) -> Reconstruction:
     return Reconstruction(Outcome.NO_CORRESPONDENCE, 'no line of plane a is one of plane b', centerlines=seen, stage_seconds=clock.laps)
 
 
-def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
+def _by_paper(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None,
+              clock: _Stopwatch) -> Reconstruction:
     """method:=paper: segment each image, correspond, triangulate, and believe eq. 3."""
     images = [dark_device(image, config.detection.polarity) for image in images]
     widths = paper.half_width_px(frame.views, config)
@@ -171,7 +176,7 @@ def _by_paper(frame: Frame, images, fields, config: Config, prior: Prior, guess:
         return Reconstruction(Outcome.NO_CORRESPONDENCE, f'{len(curves[0])} and {len(curves[1])} corresponding points', centerlines=seen, stage_seconds=clock.laps)
 
     best = max(curves, key=lambda c: arc_length(c)[-1])
-    metres_per_px = 1 / np.mean([pixels_per_metre(v.P, best) for v in frame.views])
+    metres_per_px = 1 / float(np.mean([pixels_per_metre(v.P, best) for v in frame.views]))
     sheet = sheet_of(images, fields, frame.views, 'dark')
     forward, guessed = tip_of(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, _known_order(best, prior, guess),
                               _alike(best, sheet, config))
@@ -204,12 +209,12 @@ def _confidence_of(points: np.ndarray, sheet: Sheet, config: Config) -> float:
 
 def _doubt(shape: Shape, config: Config, frame: Frame) -> tuple[Outcome, str] | None:
     """What a user has set a bound to, if the backbone is beyond it."""
-    metres_per_px = 1 / np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views])
+    metres_per_px = 1 / float(np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views]))
     return (check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
             or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
 
 
-def _tip(frame: Frame, fields, config: Config, prior: Prior, guess: Guess | None, f: Fit, alike: Callable[[], Likeness]) -> tuple[bool, bool]:
+def _tip(frame: Frame, fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None, f: Fit, alike: Callable[[], Likeness]) -> tuple[bool, bool]:
     """Whether the last end of a fit is the tip, and whether that is a guess."""
     return tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config, _known_order(f.curve(100), prior, guess), alike)
 
@@ -221,7 +226,7 @@ def _alike(points: np.ndarray, sheet: Sheet, config: Config) -> Callable[[], Lik
     return cache(partial(likeness, config.described, points, sheet, config.radius))
 
 
-def residuals_px(points: np.ndarray, views, centerlines) -> np.ndarray:
+def residuals_px(points: np.ndarray, views: Sequence[View], centerlines: Sequence[Centerline]) -> np.ndarray:
     """(N, 2) distance in px of the reprojected (N, 3) points to the centreline seen in each plane."""
     return np.stack([distance_to(project(v.P, points), undistort(v, line.points_px)) for v, line in zip(views, centerlines)], axis=1)
 
@@ -233,7 +238,7 @@ def _centerline(points_px: np.ndarray, field: np.ndarray, half_width_px: float) 
     return Centerline(points_px, 2 * half_width_px, (bool(first), bool(last)))
 
 
-def _at_border(ends: np.ndarray, views, seen) -> tuple[bool, bool]:
+def _at_border(ends: np.ndarray, views: Sequence[View], seen: Sequence[Centerline]) -> tuple[bool, bool]:
     """Whether each of a backbone's two ends belongs to a centreline's end at the field's border, in either plane."""
     at_border = np.zeros(2, bool)
     for line, view in zip(seen, views):

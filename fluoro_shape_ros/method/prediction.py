@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..data import Prior, Reconstruction
+from ..data import Prior, Reconstruction, View
 from ..geometry.cameras import depth, project
 from ..geometry.curve import arc_length, at_arc_length, even_steps
 from .fit.fit import Fit
@@ -35,7 +36,7 @@ class Guess:
         return cKDTree(self.points)
 
 
-def newest(predictions: Iterable, stamp_ns: int):
+def newest(predictions: Iterable, stamp_ns: int) -> Any:
     """Of `predictions` (anything with a stamp_ns) the newest one that is not younger than `stamp_ns`, or None."""
     return max((p for p in predictions if p.stamp_ns <= stamp_ns), key=lambda p: p.stamp_ns, default=None)
 
@@ -48,7 +49,7 @@ def staleness(prediction_ns: int, stamp_ns: int, max_age: float) -> str:
     return f'it is {age:.2f} s older than the pair, prior_max_age is {max_age:g} s' if age > max_age else ''
 
 
-def look(prior: Prior, views, sigma_tip: float) -> tuple[Guess | None, str]:
+def look(prior: Prior, views: Sequence[View], sigma_tip: float) -> tuple[Guess | None, str]:
     """The guess that a prior holds, or None and why it can't be one (empty: there is none). sigma_tip: m, its standard deviation at the tip."""
     points = prior.predicted
     if points is None or prior.prediction_fault:
@@ -117,13 +118,13 @@ def informed(f: Fit, g: Guess) -> Fit:
     return replace(f, spline=replace(f.spline, control=control), covariance=f.covariance - gain @ H @ f.covariance)
 
 
-def whole(length: float, g: Guess, views) -> bool:
+def whole(length: float, g: Guess, views: Sequence[View]) -> bool:
     """Whether a curve of `length` m may be all of the predicted device that stands in both images."""
     inside = np.all([in_image(v, project(v.P, g.points)) for v in views], axis=0)
     predicted = STEP * np.count_nonzero(inside)
     return abs(length - predicted) < LENGTH_SHARE * predicted + g.sigma[-1]
 
 
-def in_image(view, uv: np.ndarray) -> np.ndarray:
+def in_image(view: View, uv: np.ndarray) -> np.ndarray:
     """(N,) bool: which undistorted pixels (N, 2) lie in the image."""
     return ((uv > 0) & (uv < [view.width, view.height])).all(axis=1)

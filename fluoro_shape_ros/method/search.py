@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..data import View
 from ..geometry.cameras import distort, isocenter, pixels_per_metre, project, undistort
+from ..imaging.lines import Candidate
 from ..imaging.strips import Sheet
 from .features import MEAN, MEAN_PX, TIP, TIP_PX
 from .fit.fit import COARSE, Fit, fit
@@ -146,12 +149,12 @@ def _most_promising(hypotheses: Iterator[Hypothesis], first_sight: Callable[[np.
     yield from islice((others[k] for k in sorted(range(len(others)), key=lambda k: (-together[k], -odds[k]))), FITTED - AS_PROPOSED)
 
 
-def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Guess | None) -> Iterator[Hypothesis | None]:
+def _again(sheet: Sheet, radius: float, found: tuple[list[Candidate], list[Candidate]], tried: list[Attempt], guess: Guess | None) -> Iterator[Hypothesis | None]:
     """Where else it may be, when no pair of lines settled it: where a guess leads; the likeliest fits without the lines beside them, and beside these; where
     the other plane shows what one plane's line alone says; and the likeliest again with a search around them. None before what takes long."""
-    path = None if guess is None else follow(sheet, guess, radius, clear=False)
-    if path is not None:
-        yield Hypothesis(path)
+    led = None if guess is None else follow(sheet, guess, radius, clear=False)
+    if led is not None:
+        yield Hypothesis(led)
     likeliest = [t for t in sorted(tried, key=lambda t: -t.log_odds) if t.log_odds > PROMISING][:LIKELIEST]
     for t in likeliest:
         yield Hypothesis(t.fit.curve(200), t.lines, clearing=True)
@@ -165,12 +168,12 @@ def _again(sheet: Sheet, radius: float, found, tried: list[Attempt], guess: Gues
             yield None
             path = sweep(undistort(view, c.points_px), (view, views[1 - k]), (dark[k], dark[1 - k]))
             if path is not None and path.share > SEEN:
-                paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (c, None)[::1 - 2 * k]))
+                paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (None, c) if k else (c, None)))
     yield from (Hypothesis(points, lines, clearing=True) for _, points, lines in sorted(paths, key=lambda p: -p[0]))
     yield from (Hypothesis(t.fit.curve(200), t.lines, coarse=COARSE, clearing=True) for t in likeliest)
 
 
-def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options) -> Fit | None:
+def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options: Any) -> Fit | None:
     """A fit from a path that may be some px off, once more where it has not come to rest. options: of fit."""
     return fitted if fitted is None or fitted.moved_px <= RESTLESS_PX else fit(sheet, fitted.curve(200), radius, 0, **options)
 
@@ -178,7 +181,7 @@ def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options) -> Fit |
 def choose(tried: Sequence[Attempt]) -> tuple[Attempt, float]:
     """The likeliest attempt, and the probability that it is right: of curves that exclude one another at most one can be, by Bayes' rule p = o / (1 + sum of odds)."""
     ranked = sorted(tried, key=lambda t: -t.log_odds)
-    best, rivals = ranked[0], []
+    best, rivals = ranked[0], list[Attempt]()
     for t in ranked[1:]:
         if all(exclusive(t, r) for r in (best, *rivals)):
             rivals.append(t)
@@ -195,7 +198,7 @@ def exclusive(a: Attempt, b: Attempt) -> bool:
     return bool(min(cKDTree(one).query(other)[0].mean(), cKDTree(other).query(one)[0].mean()) > 2 * max(MEAN, MEAN_PX * px))
 
 
-def projected(f: Fit, view) -> np.ndarray:
+def projected(f: Fit, view: View) -> np.ndarray:
     """(200, 2) image pixels, as received, of the fitted curve."""
     return distort(view, project(view.P, f.curve(200)))
 

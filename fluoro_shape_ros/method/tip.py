@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from ..config import Config
+from ..data import View
 from ..geometry.cameras import distort, project
 from ..imaging.field import border_distance
 from .known_device import ALIKE, SURE, Likeness
 
 
-def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Callable[[], np.ndarray], base_position=(),
+def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Callable[[], np.ndarray], base_position: Sequence[float] = (),
                 previous: np.ndarray | None = None, alike: Callable[[], Likeness] = lambda: ALIKE) -> tuple[bool, bool]:
     """Whether the last of a device's two ends is the tip, and whether that is a guess.
 
@@ -37,7 +38,7 @@ def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Calla
     return bool(nearest[1] >= nearest[0]), True
 
 
-def tip_of(ends: np.ndarray, at_border: tuple[bool, bool], views, fields, config: Config, known: np.ndarray | None,
+def tip_of(ends: np.ndarray, at_border: tuple[bool, bool], views: Sequence[View], fields: Sequence[np.ndarray], config: Config, known: np.ndarray | None,
            alike: Callable[[], Likeness] = lambda: ALIKE) -> tuple[bool, bool]:
     """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
     def border_px() -> np.ndarray:

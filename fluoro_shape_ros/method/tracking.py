@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..data import Frame, Prior
+from ..data import Frame, Prior, View
 from ..imaging.prepare import region_around, sheet_of
 from ..imaging.strips import Sheet
 from .fit.fit import Fit, fit
@@ -29,10 +30,11 @@ class Near:
     alone: bool         # whether nothing but its probability asks for a search of the whole images
 
 
-def tracked(frame: Frame, images, fields, polarity: str, radius: float, prior: Prior) -> Near | None:
+def tracked(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], polarity: str, radius: float, prior: Prior) -> Near | None:
     """The device where it would be at constant velocity, else near where it was; None where it is at neither place."""
     expected = going_on(prior, frame.stamp_ns)
-    for points, coarse in ((expected, None), (prior.previous.points, 1)):
+    previous = None if prior.previous is None else prior.previous.points
+    for points, coarse in ((expected, None), (previous, 1)):
         if points is None:
             continue
         regions = [region_around(v, points) for v in frame.views]
@@ -45,7 +47,7 @@ def tracked(frame: Frame, images, fields, polarity: str, radius: float, prior: P
     return None
 
 
-def predicted(frame: Frame, images, fields, polarity: str, radius: float, guess: Guess) -> Near | None:
+def predicted(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], polarity: str, radius: float, guess: Guess) -> Near | None:
     """The device near a guess; None where the images show none there that bears it out."""
     regions = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
     sheet = sheet_of(images, fields, frame.views, polarity, regions)
@@ -58,7 +60,7 @@ def predicted(frame: Frame, images, fields, polarity: str, radius: float, guess:
     return Near(fitted, sheet, whole(fitted.stop - fitted.start, guess, sheet.views))
 
 
-def _cut_off(fitted: Fit, sheet: Sheet, regions, views) -> bool:
+def _cut_off(fitted: Fit, sheet: Sheet, regions: Sequence[tuple[slice, slice]], views: Sequence[View]) -> bool:
     """Whether it ends at the edge of a region that is not the image's: there it may go on."""
     for (rows, columns), view, part in zip(regions, views, sheet.views):
         ends, last = projected(fitted, part)[[0, -1]], np.array([columns.stop - columns.start, rows.stop - rows.start])

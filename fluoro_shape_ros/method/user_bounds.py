@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..config import Config
@@ -23,7 +25,7 @@ def curvature_limit(config: Config, metres_per_px: float) -> float:
     return config.plausibility.max_curvature or 1000.0 * config.detection.spacing_px * 1000.0 * metres_per_px
 
 
-def check_curvature(curves: list[np.ndarray], limit: float) -> tuple[Outcome, str] | None:
+def check_curvature(curves: Sequence[np.ndarray], limit: float) -> tuple[Outcome, str] | None:
     """Eq. 3 of Burgner et al. 2011 on (N, 3) control points of each estimate: None, or the rejection."""
     worst = max((float(curvature(c).max(initial=0.0)) for c in curves), default=0.0)
     if worst > limit:

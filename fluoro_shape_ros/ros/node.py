@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import re
 import time
-import traceback
 from collections import deque
 from functools import lru_cache
 
@@ -26,13 +25,15 @@ from msg_adapters.shapes import BadPath, path_to_points
 
 from ..config import Config, ConfigError
 from ..data import Frame, Outcome, Reconstruction
-from ..method.pipeline import reconstruct
 from ..method.prediction import newest
 from . import parameters as params
+from .calibration_watch import CalibrationWatch
 from .frame_names import doubts
 from .message_sizes import bounded
 from .outputs import Outputs
 from .pairing import PLANES, Pairer
+from .reconstruction_process import Bug, BugThere
+from .reconstructor import Reconstructor
 from .subscriptions import Inputs, path_of, surviving
 from .transforms import TfMissing, TfPoses, import_tf
 from .waiting import CameraBook, Pair, WaitingRoom
@@ -45,26 +46,36 @@ WARN_S = 30.0           # ... and another one after that
 
 
 class FluoroShapeNode(Node):
-    """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread reconstructs and publishes.
+    """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread has the newest pair reconstructed and publishes.
 
     Raises ConfigError where a parameter given at the start can't work, and TfMissing where it asks for tf and there is none.
     """
 
-    def __init__(self):
+    _levels: list[int] | None
+    _doubts: tuple[str, ...]
+    _lookup: TfPoses | None
+    _threads: int | None
+    _left: tuple[Job, Frame | None, Reconstruction, float] | None
+    _inputs: Inputs | None
+
+    def __init__(self, reconstructor: Reconstructor):
         super().__init__('fluoro_shape')
         self._config = params.declare(self)
         self._enabled, self._overdue, self._levels, self._room = True, False, None, WaitingRoom()
         self._trouble, self._namesakes, self._has_result = ('', 0.0), '', False     # which, since when
         self._predictions, self._doubts = deque(maxlen=PREDICTIONS), ()
         self._pairer, self._books = Pairer(self._slop_ns), {plane: CameraBook() for plane in PLANES}
-        self._tally, self._memory = Tally(), Memory()
+        self._tally, self._memory, self._watch = Tally(), Memory(), CalibrationWatch()
         self._view_of, self._lookup, self._threads = lru_cache(maxsize=8)(view_of), None, None
+        self._reconstructor, self._restarted = reconstructor, ''      # why it was lately
+        self._left = None       # of the pair answered last: it, and what is to be told of it
+        reconstructor.told = self._on_restart
 
         overridable = QoSOverridingOptions.with_default_policies()
         self._outputs = Outputs(self)
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10), qos_overriding_options=overridable)
         self._answered = self.create_guard_condition(self._report_changes)
-        self._worker = Worker(self._work, self._failed)
+        self._worker = Worker(self._work, self._failed, self._get_ready)
         self._inputs = None
         self._listen()
         self.create_subscription(Path, 'predicted_backbone', surviving(self._on_prediction, self._bug), QoSProfile(depth=1),
@@ -78,11 +89,13 @@ class FluoroShapeNode(Node):
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))    # also while /clock stands still
         unknown = params.unknown(self)
         if unknown:
-            self.get_logger().warn(unknown)
+            self.get_logger().warning(unknown)
         self._introduce()
 
     def stop(self, timeout_s: float) -> bool:
-        """End the worker; whether it got to the end of its pair in time."""
+        """End the worker, which is given that long for the pair at work, if there is one; False where it can't be ended."""
+        if not self._worker.stop(timeout_s if self._worker.busy_s else 0.0):
+            self._reconstructor.end()
         return self._worker.stop(timeout_s)
 
     @property
@@ -114,7 +127,7 @@ class FluoroShapeNode(Node):
             self._tally.event('unstamped')
         if counts.jumps > jumps:
             self._tally.event('jump')
-            self.get_logger().warn(f'plane {plane}: stamps jumped back: starting anew')
+            self.get_logger().warning(f'plane {plane}: stamps jumped back: starting anew')
             self._forget()
             for book in self._books.values():
                 book.rewind(stamp)
@@ -160,7 +173,7 @@ class FluoroShapeNode(Node):
             cameras = tuple(self._books[plane].at(stamp) for plane, stamp in zip(PLANES, pair.stamps))
             self._doubts = doubts(self._config, tuple(image.header.frame_id for image in pair.items), cameras)
             if self._doubts:
-                self.get_logger().warn('; '.join(self._doubts), throttle_duration_sec=WARN_S)
+                self.get_logger().warning('; '.join(self._doubts), throttle_duration_sec=WARN_S)
             prediction = newest(self._predictions, pair.stamps[0])
             lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, prediction))
         self._drop(lost)
@@ -181,6 +194,7 @@ class FluoroShapeNode(Node):
     def _on_reset(self, request, response):
         self._pairer.reset()
         self._forget()
+        self._watch.reset()
         response.success, response.message = True, 'tracking state and buffered frames forgotten'
         return response
 
@@ -228,8 +242,14 @@ class FluoroShapeNode(Node):
 
     # ---- what goes out
 
+    def _get_ready(self, waited_for: bool) -> None:
+        """In the worker's thread, before each pair and now and then while there is none."""
+        if not waited_for or self._reconstructor.here:      # else that is done while the next one is reconstructed over there
+            self._finish()
+        self._reconstructor.get_ready()
+
     def _work(self, job: Job) -> None:
-        """A pair from messages to messages, in the worker's thread."""
+        """A pair from messages to messages, in the worker's thread; all but the answer itself is left for `_finish`."""
         budget = job.config.input.time_budget
         until = time.monotonic() + budget if budget else None
         if job.config.input.threads != self._threads:
@@ -237,18 +257,33 @@ class FluoroShapeNode(Node):
             cv2.setNumThreads(self._threads or -1)      # 0 would mean none for OpenCV
         adapted = adapt(job, self._view_of, self._lookup, self._tally)
         frame, result = (None, adapted) if isinstance(adapted, Reconstruction) else (adapted, self._reconstruct(job, adapted, until))
-        if result is not None:
-            self._tally.result(result, time.monotonic() - job.arrived)
-        self._answered.trigger()
-        if result is not None:
+        latency_s = time.monotonic() - job.arrived
+        self._finish()
+        if result is None:
+            self._answered.trigger()
+        else:
+            self._left = job, frame, result, latency_s
+
+    def _finish(self) -> None:
+        """Count, watch and explain what was answered last, if that was not done yet."""
+        if self._left is None:
+            return
+        (job, frame, result, latency_s), self._left = self._left, None
+        self._tally.result(result, latency_s)
+        try:
+            self._answered.trigger()
+            if frame is not None:
+                self._watch.take(result, frame.views, job.cameras)
             self._outputs.explain(job, frame, result)
+        except Exception as error:  # it belongs to this pair, and not to the one that may be under way
+            self._bug(error, latency_s)
 
     def _reconstruct(self, job: Job, frame: Frame, until: float | None) -> Reconstruction | None:
         """The published answer to a frame; None where it went into the mask or was overtaken by a reset."""
         window = image_window(job, frame)
         if self._memory.take_for_mask(frame, window):
             return None
-        result = reconstruct(frame, job.config, self._memory.prior(job, frame, window), until)
+        result = self._reconstructor(frame, job.config, self._memory.prior(job, frame, window), until, self._finish)
         if not self._memory.remember(job, frame, result):
             return None
         self._outputs.answer(frame, result)
@@ -262,15 +297,23 @@ class FluoroShapeNode(Node):
         self._bug(error, time.monotonic() - job.arrived)
 
     def _bug(self, error: Exception, latency_s: float = 0.0) -> None:
-        """An exception that nobody foresaw, in either thread: said once, counted always."""
+        """An exception that nobody foresaw, in either thread or in the process that reconstructs: said once, counted always."""
         if not self.context.ok():   # what fails while the node goes down is no news
             return
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        bug = f'{type(error).__name__} in {place.filename}:{place.lineno}'
-        if not self._tally.count(bug):
-            self.get_logger().error(''.join(traceback.format_exception(error)))
-        self._tally.event(bug)
-        self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}'), latency_s)
+        bug = error.bug if isinstance(error, BugThere) else Bug.of(error)
+        if not self._tally.count(bug.kind):
+            self.get_logger().error(bug.trace)
+        self._tally.event(bug.kind)
+        self._tally.result(Reconstruction(Outcome.INTERNAL_ERROR, bug.words), latency_s)
+        self._answered.trigger()
+
+    def _on_restart(self, reason: str) -> None:
+        """The process that reconstructs was lost; in the worker's thread."""
+        if not self.context.ok():
+            return
+        self._restarted = f'reconstruction restarted: {reason}'
+        self._tally.event('restart')
+        self.get_logger().error(self._restarted)
         self._answered.trigger()
 
     def _summaries(self) -> tuple:
@@ -281,9 +324,12 @@ class FluoroShapeNode(Node):
                                       lossy=any(plane.reliability == 'best_effort' for plane in planes))
         fault = self._tally.reason('prediction')
         still = 'use_sim_time is set, but there is no /clock' if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else ''
-        notes = tuple(filter(None, (self._memory.note, fault and f'predicted_backbone: {fault}', still, self._namesakes, *self._doubts)))
-        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes,
-                                             overdue_s=self._overdue_s())
+        restarted = self._restarted if self._tally.lately('restart') else ''
+        watch = self._watch.finding
+        notes = tuple(filter(None, (restarted, self._memory.note, fault and f'predicted_backbone: {fault}', still, self._namesakes, *self._doubts,
+                                    str(watch) if watch.noticed else '')))
+        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes, calibration=str(watch),
+                                             overdue_s=self._overdue_s(), here=self._reconstructor.here, restarts=self._tally.count('restart'))
         return planes, pairing, results
 
     def _statuses(self) -> list:
@@ -324,6 +370,8 @@ class FluoroShapeNode(Node):
         frame = f'frame "{given.input.reference_frame}"' if given.input.reference_frame else 'the frame of plane A\'s camera info'
         self.get_logger().info(f'images on {images}, cameras on {infos} (geometry {given.input.geometry}); results on {named("backbone")} and '
                                f'{named("tip")} in {frame}; method {given.curve.method}, {_radius(given)}')
+        if self._reconstructor.here:
+            self.get_logger().info(f'reconstructing in a thread of the node, not in a process of its own: {self._reconstructor.here}')
 
     def _warn(self) -> None:
         """A line in the log now and then, while no results come or another node has the same name."""
@@ -331,13 +379,15 @@ class FluoroShapeNode(Node):
         count = self.get_node_names_and_namespaces().count(me)
         self._namesakes = f'{count} nodes are named {self.get_fully_qualified_name()}: end all but one, or give them other names' if count > 1 else ''
         if self._namesakes:
-            self.get_logger().warn(self._namesakes, throttle_duration_sec=WARN_S)
+            self.get_logger().warning(self._namesakes, throttle_duration_sec=WARN_S)
+        if self._watch.finding.noticed:
+            self.get_logger().warning(str(self._watch.finding), throttle_duration_sec=WARN_S)
         words, now = trouble(*self._summaries()), time.monotonic()
         kind = re.sub(r'[\d.]+|, most often.*', '', words)
         if kind != self._trouble[0]:
             self._trouble = kind, now
         if words and now > self._trouble[1] + PERSISTENT_S:
-            self.get_logger().warn(f'no results: {words}', throttle_duration_sec=WARN_S)
+            self.get_logger().warning(f'no results: {words}', throttle_duration_sec=WARN_S)
 
 
 def _radius(config: Config) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import ParameterDescriptor
@@ -53,7 +54,7 @@ class AdaptiveSubscription:
     def __init__(self, node: Node, msg_type, topic: str, callback: Callable, depth: int, image_reliability: str):
         self._node, self._depth = node, depth
         self._msg_type, self._topic, self._callback = msg_type, topic, callback
-        self._subscription = None
+        self._subscription: Any = None
         wanted = _reliability(node, node.resolve_topic_name(topic), image_reliability)
         self._auto = wanted == 'auto'
         self._make(QoSReliabilityPolicy.BEST_EFFORT if wanted == 'best_effort' else QoSReliabilityPolicy.RELIABLE)
@@ -93,9 +94,9 @@ class AdaptiveSubscription:
         topic = self._subscription.topic_name
         if event.last_policy_kind != QoSPolicyKind.RELIABILITY or not self._auto:
             policy = QoSPolicyKind(event.last_policy_kind).name.lower()
-            self._node.get_logger().warn(f'{topic}: a publisher offers an incompatible {policy}: it is not heard')
+            self._node.get_logger().warning(f'{topic}: a publisher offers an incompatible {policy}: it is not heard')
         elif not self.best_effort:
-            self._node.get_logger().warn(f'{topic}: a publisher offers only best-effort: taking that, images may get lost')
+            self._node.get_logger().warning(f'{topic}: a publisher offers only best-effort: taking that, images may get lost')
             self._make(QoSReliabilityPolicy.BEST_EFFORT)
 
     def _matched(self, event) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 from .pairing import JUMP_NS
 
@@ -95,7 +96,7 @@ class Pair:
     """Two frames that belong together."""
 
     stamps: tuple[int, int]     # ns
-    items: tuple[object, object]
+    items: tuple[Any, Any]
     arrived: float              # s, when the second one came
 
 

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from ..method.prediction import staleness
 from .message_sizes import Oversized
 from .pairing import PLANES
 
+LOOK_S = 0.5            # between two looks at whether all is ready for a job
+
 
 class NoTransform(LookupError):
     """A pose that tf does not know; the message names the frames."""
@@ -31,7 +34,7 @@ class Camera:
     """A CameraInfo; two of them are equal when they are the same camera, whatever their stamps."""
 
     content: tuple
-    msg: object = field(compare=False)
+    msg: Any = field(compare=False)
 
     @property
     def window(self) -> tuple:
@@ -70,7 +73,7 @@ class Job:
     """A pair of messages and everything that holds for it."""
 
     stamp_ns: int                           # of plane A's image
-    images: tuple[object, object]           # sensor_msgs/Image or CompressedImage
+    images: tuple[Any, Any]                 # sensor_msgs/Image or CompressedImage
     cameras: tuple[Camera | None, Camera | None]
     config: Config
     generation: int                         # of the memory when the pair came
@@ -202,7 +205,7 @@ class Memory:
             known = [(shape, stamp_ns) for shape, stamp_ns, frame_id in self._last if job.config.curve.tracking and frame_id == frame.frame_id]
             before, previous = [(None, None)] * (2 - len(known)) + known
             points, fault = _predicted(job, frame)
-            return Prior(*previous, *before, self._masks, points, fault, self._search)
+            return Prior(previous[0], previous[1], before[0], before[1], self._masks, points, fault, self._search)
 
     def remember(self, job: Job, frame: Frame, result: Reconstruction) -> bool:
         """Keep the shape of a result for the next pair; False where the result is out of date and must not be published."""
@@ -234,13 +237,16 @@ def _predicted(job: Job, frame: Frame) -> tuple[np.ndarray | None, str]:
 class Worker:
     """A thread that works on the newest job offered; a job that nobody got to is overtaken by the next.
 
-    An exception of `work(job)` goes to `failed(job, error)` and the next job goes on.
+    An exception of `work(job)` goes to `failed(job, error)` and the next job goes on. `get_ready(waits)` is called before each, and every LOOK_S while none
+    waits.
     """
 
-    def __init__(self, work: Callable[[Job], None], failed: Callable[[Job, Exception], None]):
-        self._work, self._failed = work, failed
+    def __init__(self, work: Callable[[Job], None], failed: Callable[[Job, Exception], None], get_ready: Callable[[bool], None] = lambda waits: None):
+        self._work, self._failed, self._get_ready = work, failed, get_ready
         self._changed = threading.Condition()
-        self._job, self._stopped, self._began = None, False, None
+        self._job: Job | None = None
+        self._began: float | None = None
+        self._stopped = False
         self._thread = threading.Thread(target=self._run, name='reconstruction', daemon=True)
         self._thread.start()
 
@@ -272,11 +278,14 @@ class Worker:
 
     def _run(self) -> None:
         while True:
+            self._get_ready(self._job is not None)
             with self._changed:
-                self._changed.wait_for(lambda: self._job is not None or self._stopped)
+                self._changed.wait_for(lambda: self._job is not None or self._stopped, LOOK_S)
                 if self._stopped:
                     return
                 job, self._job = self._job, None
+            if job is None:
+                continue
             self._began = time.monotonic()
             try:
                 self._work(job)

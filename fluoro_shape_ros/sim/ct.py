@@ -282,7 +282,7 @@ def _dicom(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if not mean > 0 or np.linalg.norm(steps - mean * axes[0], axis=1).max() > UNEVEN * mean:
         raise CtError(f'{folder}: its slices are not evenly spaced: some are missing, double or shifted')
     hu = np.stack([_slice(files[k]) for k in order])
-    hu = np.flip(hu, [k for k in range(3) if axes[k, along[k]] < 0])
+    hu = np.flip(hu, tuple(k for k in range(3) if axes[k, along[k]] < 0))
     to_zyx = [list(along).index(k) for k in (2, 1, 0)]
     return hu.transpose(to_zyx), np.array([mean, *grids[0, 6:8]])[to_zyx] / 1e3
 

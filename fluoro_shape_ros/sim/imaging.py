@@ -135,7 +135,7 @@ def _curve(detected: np.ndarray, imaging: Imaging) -> np.ndarray:
     return np.log(positive) if imaging.display == 'logarithmic' else positive**np.float32(imaging.gamma)
 
 
-def _noise(rng: np.random.Generator, shape: tuple[int, int], sigma_px: float) -> np.ndarray:
+def _noise(rng: np.random.Generator, shape: tuple[int, ...], sigma_px: float) -> np.ndarray:
     """(H, W) float32 normal noise of unit variance, correlated by a Gaussian kernel."""
     white = rng.standard_normal(shape, dtype=np.float32)
     if sigma_px < 0.1:

@@ -126,7 +126,7 @@ def reaching(robot: TubeRobot | TendonRobot, tip: np.ndarray, q: np.ndarray) -> 
     for _ in range(60):
         error = tip - robot.backbone(q, COARSE)[-1]
         J = jacobian(robot, q) * speed
-        step = speed * (J.T @ np.linalg.solve(J @ J.T + 0.001**2 * np.eye(3), error * min(1.0, 0.005 / max(np.linalg.norm(error), 1e-9))))
+        step = speed * (J.T @ np.linalg.solve(J @ J.T + 0.001**2 * np.eye(3), error * min(1.0, 0.005 / max(float(np.linalg.norm(error)), 1e-9))))
         q = limited(robot.joints, q + step)
     return q
 

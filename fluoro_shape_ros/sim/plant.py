@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..device import Device
-from . import anatomy, carm, placement
+from ..device import REST, Device, Segment
+from . import anatomy, carm, ct, imaging, placement, variety
 from .kinematics import TendonRobot, Tube, TubeRobot, loaded, reaching
-from .scenes import FLUOROSCOPY, RADIUS, Run, Scene, with_device
+from .scenes import FLUOROSCOPY, RADIUS, Background, Run, Scene, with_device
 from .shapes import Pose
 from .xray import Exposure
 
@@ -21,6 +21,8 @@ MODEL_ERROR = 0.12          # by which a robot bends otherwise than its model
 PUSHED = (0.008, 0.012)     # m, by which tissue pushes the tip aside at the start
 REACHED = 0.1e-3        # m
 MISSED = 3e-3           # m: a target that the model alone gets nearer to shows nothing
+METAL = Device((Segment(REST, RADIUS, 'metal'),))       # what a robot is before a CT: one as pale as before drawn anatomy could not be seen
+PLACES = 50             # of a CT, of which at least one must show the robot
 UP = Pose(np.array([0.0, 0.0, -0.05]), np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))      # along z, across both beams
 
 
@@ -60,22 +62,46 @@ class Plant:
 
 
 def plant(name: str, seed: int, size: int = 512, with_anatomy: bool = True, error: float = MODEL_ERROR, pushed: tuple[float, float] = PUSHED,
-          device: Device | None = None) -> Plant:
+          device: Device | None = None, volume: ct.Volume | None = None, chain: imaging.Imaging = FLUOROSCOPY) -> Plant:
     """The robot `name` of ROBOTS as the seed makes it: it bends by `error` otherwise, and a load moves its tip aside by `pushed` m at the start, so
-    that the two do not cancel. Images have `size` x `size` px and always show the same field. It is a rod, or looks like `device` under fluoroscopy.
+    that the two do not cancel. Images have `size` x `size` px and always show the same field. It is a rod, or looks like `device` by an
+    imaging `chain`.
+
+    With a CT `volume`, which then stands in place of the drawn anatomy, it is by default METAL, and the patient lies where the seed has him, drawn anew until
+    the robot at the start is `variety.visible` under fluoroscopy. Raises CtError where it never is.
     """
     known, rng = ROBOTS[name], np.random.default_rng([seed, 8])
     views = carm.biplane(arm=carm.CArm(pixel_size_iso=FIELD / size, width=size, height=size))
-    beams = tuple(anatomy.anatomy(np.random.default_rng([seed, 3, i]), (size, size)) for i in (0, 1)) if with_anatomy else None
+    beams = tuple(anatomy.anatomy(np.random.default_rng([seed, 3, i]), (size, size)) for i in (0, 1)) if with_anatomy and volume is None else None
     run = Run(f'servo_{name}', seed, tuple(placement.Field(v) for v in views), None, 0.0, RADIUS, 'xray', Exposure(), beams)
     if device is not None:
-        run = with_device(run, device, (FLUOROSCOPY, FLUOROSCOPY))
+        run = with_device(run, device, (chain, chain))
     points = known.robot.backbone(known.start, STEP)
     aside = np.cross(points[-1] - points[-2], rng.normal(size=3))
     length = STEP * (len(points) - 1)
     load = aside / np.linalg.norm(aside) * 3 * rng.uniform(*pushed) / length**3
     robots = (known.robot.misjudged(error), known.robot.misjudged(-error))
-    return Plant(max(robots, key=lambda robot: (robot.backbone(known.start, STEP)[-1] - points[-1]) @ load), load, run)
+    moved = Plant(max(robots, key=lambda robot: (robot.backbone(known.start, STEP)[-1] - points[-1]) @ load), load, run)
+    if volume is None:
+        return moved
+    background = _place(moved, known.start, device or METAL, volume, np.random.default_rng([seed, 3]))
+    return dataclasses.replace(moved, run=_before(background, run, device or METAL, chain))
+
+
+def _place(moved: Plant, q: np.ndarray, device: Device, volume: ct.Volume, rng: np.random.Generator) -> Background:
+    """The first drawn place of a CT before which a `device` at joint values `q` can be seen. Raises CtError where there is none."""
+    whole = placement.with_shaft(moved.backbone(q), SHAFT)
+    for _ in range(PLACES):
+        background = variety.in_ct(volume, rng)
+        if variety.visible(_before(background, moved.run, device, FLUOROSCOPY), True, whole):
+            return background
+    raise ct.CtError(f'the robot of seed {moved.run.seed} can be seen in none of {PLACES} places of the CT')
+
+
+def _before(background: Background, run: Run, device: Device, chain: imaging.Imaging) -> Run:
+    """The run of a `device` before a `background`, which draws nothing more, in both planes by one imaging chain."""
+    beams = tuple(background(None, field.view, chain.energy_kev) for field in run.fields)
+    return with_device(dataclasses.replace(run, beams=beams), device, (chain, chain))
 
 
 def predicted(name: str, q: np.ndarray) -> np.ndarray:

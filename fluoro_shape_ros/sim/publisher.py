@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import rclpy
@@ -55,7 +55,7 @@ class FluoroSim:
         self._scenes, self._rate = scenes, rate
         self._reliability, self._reference_frame, self._arguments = RELIABILITIES[reliability], reference_frame, list(ros_arguments)
         self._stop = threading.Event()
-        self._streaming = None
+        self._streaming: Future | None = None
 
     def __enter__(self) -> FluoroSim:
         self._context = Context()

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -46,7 +47,7 @@ class Chain:
     """How a plane of a run takes and shows its images."""
 
     imaging: imaging.Imaging
-    levels: imaging.Levels      # set once, without the device
+    levels: imaging.Levels      # type: ignore[name-defined]    # set once, without the device
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,8 @@ class Run:
         """(H, W) float32: plane `i` before blur and noise, as a share of full scale (P) or of the open beam (X-ray); the device's shadow is
         moved by `shift_px` (u, v)."""
         view = self.fields[i].view
-        view = dataclasses.replace(view, P=view.P + np.outer([*shift_px, 0.0], view.P[2]))      # moves the principal point
+        if any(shift_px):
+            view = dataclasses.replace(view, P=view.P + np.outer([*shift_px, 0.0], view.P[2]))      # moves the principal point
         bare = np.ones((view.height, view.width), np.float32)
         if self.chains is not None:
             beam = bare if whole is None else cv2.exp(-self._depth(whole, view, self.chains[i].imaging.energy_kev))
@@ -125,7 +127,7 @@ class Run:
 
     def _depth(self, whole: np.ndarray, view: View, energy_kev: float) -> np.ndarray:
         """(H, W) float32: the device's optical depth, by this run's renderer."""
-        return (gvxr_scene if self.renderer == 'gvxr' else xray).optical_depth(whole, self.device, view, energy_kev)
+        return _depth(whole.tobytes(), self.device, view, energy_kev, self.renderer)
 
     def said(self) -> str:
         """What was drawn for a run with `chains`, in a line."""
@@ -257,7 +259,7 @@ def moving(run: Run, rate: float, count: int | None = None) -> Iterator[Scene]:
         yield run.scene_averaged(whole, before)
 
 
-def ping_pong(pairs: Sequence[Scene]) -> Iterator[Scene]:
+def ping_pong(pairs: Sequence) -> Iterator:
     """The scenes forth and back without end, so that motion never jumps."""
     return itertools.cycle([*pairs, *pairs[-2:0:-1]])
 
@@ -279,3 +281,11 @@ def _plate_over(rng: np.random.Generator, view: View, points: np.ndarray, hidden
     centre, ahead = project(view.P, points[[k, k + 5]])
     turn = np.arctan2(*(ahead - centre)[::-1])
     return surroundings.plate((view.height, view.width), centre, (hidden_px, rng.uniform(30, 90)), turn, rng.uniform(0.003, 0.02))
+
+
+@lru_cache(4)
+def _depth(whole: bytes, device: Device, view: View, energy_kev: float, renderer: str) -> np.ndarray:
+    """(H, W) float32 of `Run._depth`, kept for both planes with and without what stands behind: it takes longest by far."""
+    depth = (gvxr_scene if renderer == 'gvxr' else xray).optical_depth(np.frombuffer(whole).reshape(-1, 3), device, view, energy_kev)
+    depth.flags.writeable = False
+    return depth

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -77,13 +78,15 @@ def gvxr_run(seed: int) -> Run:
     return Run(('rod', 'tube')[seed % 2], seed, fields, shape, shaft, radius, 'gvxr', device=device, chains=(Chain(chain, levels),) * 2)
 
 
-def visibility(run: Run) -> tuple[float, float]:
+def visibility(run: Run, whole: np.ndarray | None = None) -> tuple[float, float]:
     """How well a person can see a run's device where it shows least, in the plane that shows it less: (signal to noise, grey levels).
+
+    `whole` is its (N, 3) backbone; None: at the start.
 
     Both are taken in pieces of PIECE, and are those of the lowest tenth of the pieces: the signal-to-noise ratio that a matched filter has for each px of length (Rose
     1948 asks for 5 in all: 25 px at 1), and by how much the display shows the device darker than what lies behind it, as a share of its full scale.
     """
-    whole, found = run.backbone(), []
+    whole, found = run.backbone() if whole is None else whole, []
     truth = placement.seen_in_both(whole, run.fields)
     pieces = np.minimum((arc_length(truth) / PIECE).astype(int), max(int(arc_length(truth)[-1] / PIECE) - 1, 0))
     for i, (chain, field) in enumerate(zip(run.chains, run.fields)):
@@ -106,8 +109,9 @@ def visibility(run: Run) -> tuple[float, float]:
     return tuple(float(x) for x in np.min(found, axis=0))
 
 
-def _visible(run: Run, before_anatomy: bool) -> bool:
-    signal, darker = visibility(run)
+def visible(run: Run, before_anatomy: bool, whole: np.ndarray | None = None) -> bool:
+    """Whether a person can see a run's device in both planes, all along `whole`, see `visibility`."""
+    signal, darker = visibility(run, whole)
     return signal >= (BEFORE_ANATOMY if before_anatomy else VISIBLE) and darker >= DARKER
 
 
@@ -118,17 +122,17 @@ def _drawn(seed: int, name: str, make_device: Callable[[np.random.Generator], De
         rng = np.random.default_rng([attempt, 7])
         device, views = make_device(rng), draw_views(rng, coarsest)
         room = SHARE * SIZE_PX / max(pixels_per_metre(v.P, np.zeros((1, 3))) for v in views)
-        drawn = dict(views=views, kind=str(rng.choice(SHAPES)), lengths=(min(LENGTHS[0], 0.6 * room), min(LENGTHS[1], room)), device=device,
+        drawn: dict[str, Any] = dict(views=views, kind=str(rng.choice(SHAPES)), lengths=(min(LENGTHS[0], 0.6 * room), min(LENGTHS[1], room)), device=device,
                      chains=(imaging.draw(rng), imaging.draw(rng)), entering=bool(rng.random() < ENTERING) if entering is None else entering,
                      clutter=_clutter(rng, backgrounds is not None), anatomy=False)
         try:
             alone = xray_run(attempt, **drawn)
         except ValueError:      # no such shape fits
             continue
-        if not _visible(alone, backgrounds is not None):    # most that can't be seen can't be seen before nothing either, which takes less time to find out
+        if not visible(alone, backgrounds is not None):    # most that can't be seen can't be seen before nothing either, which takes less time to find out
             continue
         run = xray_run(attempt, **drawn, background=backgrounds(rng)) if backgrounds else alone
-        if run is alone or _visible(run, True):
+        if run is alone or visible(run, True):
             return dataclasses.replace(run, name=name)
     raise ValueError(f'no {name} of seed {seed} can be seen ({ATTEMPTS} drawn)')
 

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from fluoro_shape_ros.device import REST, Device, Segment
+from fluoro_shape_ros.geometry.cameras import project
 from fluoro_shape_ros.resources import resource_path
-from fluoro_shape_ros.sim import plant
+from fluoro_shape_ros.sim import ct, placement, plant, variety
 from fluoro_shape_ros.sim.kinematics import limited
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,6 +48,27 @@ def test_a_plant_shows_its_robot_with_a_shaft_that_comes_in_through_the_border()
     assert blind.frame.images[0] is scene.frame.images[0] and blind.frame.images[1].min() > scene.frame.images[1].min()
 
 
+def block(bone):
+    """A cube of water of 18 cm, of which a third, on the patient's right, has `bone` Hounsfield units."""
+    hu = np.full((24, 24, 24), -1000, np.int16)
+    hu[1:-1, 1:-1, 1:-1] = 0
+    hu[1:-1, 1:-1, 1:9] = bone
+    return ct.Volume(hu, np.full(3, 0.008))
+
+
+def test_a_ct_lies_where_the_robot_can_be_seen(monkeypatch):
+    thick, places, in_ct = Device((Segment(REST, 0.002, 'metal'),)), [], variety.in_ct
+    monkeypatch.setattr(variety, 'in_ct', lambda *drawn: places.append(drawn) or in_ct(*drawn))
+    moved = plant.plant('two_tubes', 2, 128, device=thick, volume=block(3000))
+    assert len(places) > 1      # behind bone it can't
+    whole = placement.with_shaft(moved.backbone(plant.ROBOTS['two_tubes'].start), plant.SHAFT)
+    assert variety.visible(moved.run, True, whole)
+    assert_allclose(moved.load, plant.plant('two_tubes', 2, 64, with_anatomy=False).load)       # the same robot, otherwise
+    monkeypatch.setattr(plant, 'PLACES', 2)
+    with pytest.raises(ct.CtError, match='seed 2 can be seen in none of 2 places of the CT'):
+        plant.plant('two_tubes', 2, 128, device=thick, volume=block(3000))
+
+
 # ---- the example controller, without a network
 
 rclpy = pytest.importorskip('rclpy')
@@ -64,8 +87,32 @@ def controller():
 
 def joints(q, k):
     from sensor_msgs.msg import JointState
-    msg = JointState(position=list(q))
+    names = [joint.name for joint in plant.ROBOTS['two_tubes'].robot.joints]
+    return stamped(JointState(name=names, position=list(q)), k)
+
+
+def turned(msg):
+    """The same joints in another order, with another robot's among them."""
+    msg.name, msg.position = ['gripper', *msg.name[::-1]], [0.5, *msg.position[::-1]]
+    return msg
+
+
+def tip_pose(xyz, k, sigmas=(1e-4, 1e-4, 1e-4)):
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    msg = PoseWithCovarianceStamped()
+    msg.pose.pose.position.x, msg.pose.pose.position.y, msg.pose.pose.position.z = map(float, xyz)
+    msg.pose.covariance = np.diag([*np.square(sigmas), 9.0, 9.0, 9.0]).ravel()
     return stamped(msg, k)
+
+
+def stepped(node, sent, q, msg):
+    """(3,) by how much the model's tip moves from joints `q` to what `msg` makes the controller command."""
+    sent.clear()
+    node.on_tip_pose(msg)
+    (command,) = sent
+    robot = plant.ROBOTS['two_tubes'].robot
+    assert command.name == [joint.name for joint in robot.joints]
+    return robot.backbone(np.array(command.position), 5e-4)[-1] - robot.backbone(q, 5e-4)[-1]
 
 
 def point(xyz, k=0):
@@ -76,22 +123,84 @@ def point(xyz, k=0):
 
 
 def stamped(msg, k):
-    msg.header.stamp.sec, msg.header.stamp.nanosec = 1, k * PERIOD_NS
+    msg.header.stamp.sec, msg.header.stamp.nanosec = 1, round(k * PERIOD_NS)
     return msg
 
 
 def test_it_goes_a_third_of_the_way_from_where_the_joints_were(controller):
     node, sent = controller
-    robot, q = plant.ROBOTS['two_tubes'].robot, plant.ROBOTS['two_tubes'].start
-    tip, target = np.zeros(3), np.array([1e-3, -2e-3, 1e-3])      # the model is elsewhere: only the difference counts
+    q, target = plant.ROBOTS['two_tubes'].start, np.array([1e-3, -2e-3, 1e-3])
     node.on_target(point(target))
     for k, moved in enumerate((q, q + 0.001)):
         node.on_joint_states(joints(moved, k))
+    # the model is elsewhere: only the difference counts
+    assert_allclose(stepped(node, sent, q, tip_pose(np.zeros(3), 0)), 0.35 * target, atol=0.15e-3)
+
+
+def test_joints_go_by_name_and_are_taken_between_the_states_around_the_images(controller):
+    node, sent = controller
+    q, moved = plant.ROBOTS['two_tubes'].start, np.array([0.01, -0.02, 0.3, -0.5])
+    node.on_target(point(np.zeros(3)))
+    for k, part in ((0, 0.0), (0.5, 0.5), (1.5, 0.7)):
+        node.on_joint_states(turned(joints(q + part * moved, k)))
+    for k, part in ((0, 0.0), (0.25, 0.25), (0.75, 0.55), (1.5, 0.7)):
+        sent.clear()
+        node.on_tip_pose(tip_pose(np.zeros(3), k, (1e-7,) * 3))     # at its target: stay where the images have it
+        assert_allclose(sent.pop().position, q + part * moved, atol=1e-5)
     sent.clear()
-    node.on_tip(point(tip, 0))
-    (command,) = sent
-    step = robot.backbone(np.array(command.position), 5e-4)[-1] - robot.backbone(q, 5e-4)[-1]
-    assert_allclose(step, 0.35 * target, atol=0.15e-3)
+    node.on_tip_pose(tip_pose(np.zeros(3), 1.6))        # nobody knows yet where the joints were
+    lacking = joints(q, 9)
+    lacking.name, lacking.position = lacking.name[:3], lacking.position[:3]
+    node.on_joint_states(lacking)
+    assert not sent
+
+
+def test_a_measured_tip_counts_by_its_covariance_against_what_the_model_knows(controller):
+    node, sent = controller
+    q, sigma = plant.ROBOTS['two_tubes'].start, np.array([0.5e-3, 0.1e-3, 0.02e-3])
+    node.on_target(point(np.zeros(3)))
+    for k, tip in ((0, np.zeros(3)), (1, np.full(3, 1e-3))):     # at rest the model says that the tip stays where it is
+        node.on_joint_states(joints(q, k))
+        step = stepped(node, sent, q, tip_pose(tip, k, sigma))
+    believed = sigma**2 + node.drift**2         # of the first one, which nothing was known before
+    assert_allclose(node.offset + node.model, 1e-3 * believed / (believed + sigma**2), rtol=1e-4)
+    assert_allclose(step, -0.35 * (node.offset + node.model), atol=0.1e-3)
+    # once the joints moved, the model may be wrong by a share of what it says that the tip did: of the uncertain axis it is still the better witness
+    robot, before, spread = plant.ROBOTS['two_tubes'].robot, node.offset, np.diag(node.P)
+    moved = q + [0.003, 0, 0, 0]
+    node.on_joint_states(joints(moved, 2))
+    node.on_tip_pose(tip_pose(np.zeros(3), 2, sigma))
+    model = robot.backbone(moved)[-1]
+    spread = spread + (0.3 * np.linalg.norm(model - robot.backbone(q)[-1]))**2 + node.drift**2
+    assert_allclose(node.offset, before + spread / (spread + sigma**2) * (-model - before), rtol=1e-6)
+
+
+def test_a_tip_beyond_the_bound_counts_as_none_and_after_a_hold_it_is_measured_anew(controller):
+    node, sent = controller
+    q, target = plant.ROBOTS['two_tubes'].start, np.array([1e-3, -2e-3, 1e-3])
+    node.on_target(point(target))
+    node.on_joint_states(joints(q, 0))
+    node.on_tip_pose(tip_pose([5e-3, 0, 0], 0, (1e-5, 1e-5, 1e-5)))
+    sent.clear()
+    for k in (1, 2, 3):
+        node.on_joint_states(joints(q, k))
+        node.on_tip_pose(tip_pose(np.zeros(3), k, (1e-4, 1.01e-3, 1e-4)))
+    assert_allclose(sent.pop().position, q)     # it has not come for more than two pair times
+    assert not sent
+    assert_allclose(stepped(node, sent, q, tip_pose(np.zeros(3), 3, (9e-4, 9e-4, 9e-4))), 0.35 * target, atol=0.15e-3)
+
+
+def test_a_clock_that_is_set_back_begins_anew(controller):
+    node, sent = controller
+    q = plant.ROBOTS['two_tubes'].start
+    node.on_target(point(np.zeros(3)))
+    node.on_joint_states(joints(q, 8))
+    node.on_tip_pose(tip_pose(np.zeros(3), 8))
+    sent.clear()
+    node.on_joint_states(joints(q + 1, 3))
+    assert_allclose(sent.pop().position, q + 1)     # the tip was seen at a time that is still to come
+    node.on_tip_pose(tip_pose(np.zeros(3), 3))
+    assert_allclose(sent.pop().position, q + 1)
 
 
 def test_it_stays_where_it_is_once_the_tip_is_older_than_two_pair_times(controller):
@@ -99,15 +208,15 @@ def test_it_stays_where_it_is_once_the_tip_is_older_than_two_pair_times(controll
     q = plant.ROBOTS['two_tubes'].start
     node.on_target(point([0.01, 0, 0]))
     node.on_joint_states(joints(q, 0))
-    node.on_tip(point([0, 0, 0], 0))
+    node.on_tip_pose(tip_pose([0, 0, 0], 0))
     sent.clear()
     for k in (1, 2):
         node.on_joint_states(joints(q + k, k))
     assert not sent
     node.on_joint_states(joints(q + 3, 3))
     assert_allclose(sent.pop().position, q + 3)
-    node.on_tip(point([0, 0, 0], 0))        # too old to act on, and so is one without joints
-    node.on_tip(point([0, 0, 0], 9))
+    node.on_tip_pose(tip_pose([0, 0, 0], 0))        # too old to act on, and so is one without joints
+    node.on_tip_pose(tip_pose([0, 0, 0], 9))
     assert not sent
 
 
@@ -154,6 +263,32 @@ def test_the_referee_hears_from_diagnostics_when_the_node_has_its_mask():
         assert referee.masked == masked
 
 
+def test_plane_a_sees_the_square_as_a_square():
+    from fluoro_shape_ros.demo.servo_run import _square
+    seen, edge_on = (project(field.view.P, _square(np.zeros(3), 0.012)) for field in plant.plant('two_tubes', 0, 512, with_anatomy=False).run.fields)
+    assert_allclose(np.ptp(seen, axis=0), [40, 40])         # 12 mm at 0.3 mm a pixel
+    assert np.ptp(edge_on, axis=0).min() < 1e-6
+
+
+def test_the_robot_takes_commands_by_name():
+    from sensor_msgs.msg import JointState
+
+    from fluoro_shape_ros.demo.servo_robot import Robot
+    q = plant.ROBOTS['two_tubes'].start
+    robot = Robot('two_tubes', 15.0, None)
+    robot._on_command(turned(joints(q + [0.1, 0.2, 0.3, 0.4], 0)))
+    for refused in (JointState(position=q.tolist()), joints(q[:3], 0), joints(q * np.nan, 0)):     # without names, without one joint, no numbers
+        robot._on_command(refused)
+    assert_allclose(robot._command, q + [0.1, 0.2, 0.3, 0.4])
+
+
+def test_a_ct_that_is_none_is_refused_in_one_line(tmp_path, capsys):
+    from fluoro_shape_ros.demo.servo import main
+    with pytest.raises(SystemExit) as left:
+        main(['--ct', str(tmp_path / 'none.npz')])
+    assert left.value.code == 2 and capsys.readouterr().err.rstrip().splitlines()[-1].endswith('none.npz: no such CT')
+
+
 def test_the_picture_is_drawn(tmp_path):
     pytest.importorskip('matplotlib')
     import cv2
@@ -170,13 +305,11 @@ def test_the_picture_is_drawn(tmp_path):
 
 
 def test_the_example_in_the_documentation_is_the_one_that_runs():
-    for file in ('README.md', 'docs/servo.md'):
-        text = (ROOT / file).read_text(encoding='utf-8')
-        if file == 'README.md':
-            assert EXAMPLE in text and 'resource/servo.png' in text
-            continue
-        (shown,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
-        assert shown == resource_path(EXAMPLE).read_text(encoding='utf-8')
+    assert 'docs/servo.md' in (ROOT / 'README.md').read_text(encoding='utf-8')
+    text = (ROOT / 'docs' / 'servo.md').read_text(encoding='utf-8')
+    assert EXAMPLE in text and 'resource/servo.png' in text
+    (shown,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
+    assert shown == resource_path(EXAMPLE).read_text(encoding='utf-8')
 
 
 # ---- on real topics

@@ -12,7 +12,7 @@ from fluoro_shape_ros.geometry.curve import arc_length, resample
 from fluoro_shape_ros.geometry.spline import through
 from fluoro_shape_ros.imaging.field import field_of_view
 from fluoro_shape_ros.imaging.prepare import sheet_of
-from fluoro_shape_ros.method.features import BLOCK, NAMES, Features, at_first_sight, features
+from fluoro_shape_ros.method.features import NAMES, Features, at_first_sight, features
 from fluoro_shape_ros.method.fit.fit import fit
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
@@ -21,6 +21,7 @@ from fluoro_shape_ros.sim.xray import Exposure
 SIZE = 512
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
 PX = 0.3e-3
+DIAGONAL_PX = SIZE * np.sqrt(2)
 ROUNDING = 0.01        # OpenCV 4 interpolates at places rounded to 1/32 px
 LITTLE = 0.1            # what a display's offset may change: the square root of counts no longer makes their noise quite even
 
@@ -201,13 +202,13 @@ def test_where_it_leaves_the_field_an_end_says_nothing_against_it():
 
 
 def test_the_shape_by_hand():
-    """A length is in px of the finer plane, along an arc too."""
+    """A length is a share of the diagonal, along an arc too."""
     sheet, f = known()
     angle = np.linspace(-0.6, 0.6, 300)
     arc = 0.04 * np.c_[np.zeros(300), np.sin(angle), np.cos(angle) - 1]
     turned, straight = named(by_hand(resample(arc, PX)[0]), sheet), named(by_hand(np.c_[np.zeros((200, 2)), np.linspace(-0.03, 0.03, 200)]), sheet)
-    assert_allclose([turned['length'], straight['length']], np.log([0.048 / PX, 0.06 / PX]), atol=0.02)
-    assert straight['length'] > np.log(2 * BLOCK)
+    assert_allclose([turned['length'], straight['length']], np.log(np.array([0.048, 0.06]) / PX / DIAGONAL_PX), atol=0.02)
+
 
 
 def test_what_is_handed_on():

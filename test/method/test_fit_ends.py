@@ -107,7 +107,7 @@ def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):
 def placed(s, presence, sigma, speed, guess, outward, beyond):
     """m: where the device ends, and its standard deviation."""
     end, = locate(s[None], presence.T[None], sigma[None], speed.T[None], np.array([guess]), np.array([outward]), beyond[None], np.zeros((1, 2)))
-    return end.at, end.honest_sigma(SPEED.mean())
+    return end.at, end.honest_sigma
 
 
 @pytest.mark.parametrize('outward', [1, -1])

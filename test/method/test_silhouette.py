@@ -183,7 +183,7 @@ def test_levels_polarity_and_a_mask_image_change_nothing():
 
 
 def test_a_device_is_tracked_and_nothing_is_no_device():
-    truth, masks = silhouettes(1)
+    truth, masks = silhouettes(1, jagged=False)        # rough ends lie elsewhere on strips that are laid out otherwise
     first = answer(truth, masks)
     again = answer(truth, masks, prior=Prior(previous=first.shape, previous_stamp_ns=0))
     assert 'search' not in again.stage_seconds and np.linalg.norm(again.shape.tip - first.shape.tip) < 0.2e-3

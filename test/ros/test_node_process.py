@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 import ros_client as ros
+from processes import gone, reconstructing_for
 from ros_client import BASE, Client, NodeProcess
 
 from fluoro_shape_ros.resources import resource_path
@@ -34,31 +35,46 @@ def test_images_before_any_camera_info_a_qos_override_and_sigint(log):
         assert node.end(signal.SIGINT) == 0 and 'Traceback' not in node.log
 
 
+HERE = 'import os; del os.memfd_create'     # so that the node itself reconstructs, and not a process of its own
+
+
+def spoilt(patch, folder, here):
+    """The code of a node where `patch` is run in the process that reconstructs: the node itself (`here`), or its child, which takes it from its path."""
+    if here:
+        return f'{HERE}\n{patch}\nimport sys; from fluoro_shape_ros.node import main; sys.exit(main())'
+    (folder / 'sitecustomize.py').write_text(patch)
+    return f'import sys; from fluoro_shape_ros.node import main; sys.path.insert(0, {str(folder)!r}); sys.exit(main())'
+
+
+@pytest.mark.parametrize('here', [True, False], ids=['here', 'there'])
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT], ids=lambda s: s.name)
-def test_a_signal_in_the_middle_of_a_pair(log, number):
+def test_a_signal_in_the_middle_of_a_pair(log, tmp_path, number, here):
     """A pair that never ends: the worker's thread can't be joined."""
-    code = """if True:
-        import sys, threading
+    code = spoilt("""if True:
+        import threading
         import fluoro_shape_ros.method.pipeline as pipeline
-        from fluoro_shape_ros.node import main
-        pipeline.reconstruct = lambda *_: print('at work', flush=True) or threading.Event().wait()
-        sys.exit(main())"""
+        pipeline.reconstruct = lambda *_: print('at work', flush=True) or threading.Event().wait()""", tmp_path, here)
     with NodeProcess(log, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected(), node.log
         assert client.insist(lambda: 'at work' in node.log)
         assert node.end(number) == 0 and 'Traceback' not in node.log
 
 
-@pytest.mark.parametrize('first, second', [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGTERM)])
+@pytest.mark.parametrize('first, second', [
+    (signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGTERM), (signal.SIGHUP, signal.SIGHUP)])
 def test_more_signals_while_it_ends_change_nothing(log, first, second):
     with NodeProcess(log, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.until(lambda: 'images on' in node.log)
+        pids = reconstructing_for(node.process.pid)
         node.process.send_signal(first)
-        while node.process.poll() is None:
-            node.process.send_signal(second)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                node.process.wait(timeout=0.003)
+        for _ in range(100):        # not for ever: Python is kept busy by signals
+            if node.process.poll() is None:
+                node.process.send_signal(second)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    node.process.wait(timeout=0.003)
+        node.process.wait(timeout=30)
         assert node.process.returncode == 0 and 'Traceback' not in node.log, node.log
+        assert len(pids) == 1 and gone(*pids)
 
 
 def test_the_log_tells_what_it_listens_to_what_is_missing_and_the_first_result(log):
@@ -90,18 +106,16 @@ def test_two_nodes_of_one_name_are_told(log, tmp_path):
         assert client.hears(words) and (node.end(), other.end()) == (0, 0)
 
 
-def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log):
-    code = """if True:
-        import sys
+@pytest.mark.parametrize('here', [True, False], ids=['here', 'there'])
+def test_a_bug_is_told_once_and_counted_and_the_next_pair_goes_on(log, tmp_path, here):
+    code = spoilt("""if True:
         import fluoro_shape_ros.method.pipeline as pipeline
-        from fluoro_shape_ros.node import main
         real, left = pipeline.reconstruct, [0, 0]
         def buggy(*arguments):
             if left:
                 return [][left.pop()]
             return real(*arguments)
-        pipeline.reconstruct = buggy
-        sys.exit(main())"""
+        pipeline.reconstruct = buggy""", tmp_path, here)
     with NodeProcess(log, BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected() and client.insist(lambda: client.paths), node.log
         assert client.value('reconstruction', 'count internal_error') == '2'
@@ -167,8 +181,9 @@ def test_parameter_files_that_are_installed(tmp_path):
 
 
 def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log):
-    code = """if True:
+    code = f"""if True:
         import sys, threading
+        {HERE}
         import fluoro_shape_ros.method.pipeline as pipeline
         from fluoro_shape_ros.ros import node as ros_node
         from fluoro_shape_ros.node import main
@@ -183,7 +198,7 @@ def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log
             if any('takes' in s.message for s in statuses):
                 told.set()
             return make(statuses, *rest)
-        ros_node.reconstruct, ros_node.bounded, ros_node.diagnostic_array = long, buggy, told_of
+        pipeline.reconstruct, ros_node.bounded, ros_node.diagnostic_array = long, buggy, told_of
         sys.exit(main())"""
     with NodeProcess(log, BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected()

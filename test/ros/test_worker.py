@@ -249,6 +249,23 @@ def test_a_bug_is_reported_and_the_next_job_goes_on(worker, gate):
     assert gate.idle.wait(SECONDS) and gate.failed == [('bug', 'a bug')]
 
 
+def test_no_job_is_taken_before_all_is_ready_and_then_the_newest(gate):
+    asked, ready = threading.Event(), threading.Event()
+
+    def get_ready(waits):
+        asked.set()
+        assert ready.wait(SECONDS)
+    gate.open.set()
+    worker = Worker(gate.work, gate.fail, get_ready)
+    assert asked.wait(SECONDS) and not worker.offer('first') and worker.offer('last')
+    assert gate.done == [] and worker.busy_s == 0
+    ready.set()
+    assert gate.idle.wait(SECONDS) and gate.done == ['last']
+    asked.clear()
+    assert asked.wait(SECONDS)      # also while there is no job
+    assert worker.stop(SECONDS)
+
+
 def test_how_long_a_job_has_been_at_work_is_known(worker, gate):
     assert worker.busy_s == 0
     worker.offer('first')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,13 +17,13 @@ PALEST = 0.03           # of the usual darkness: a paler device is not told from
 ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not within so many px
 BAND, SOFT_TIP = 3e-3, 2e-3     # m: longest marker band, and farthest that a device goes on past one at its end
 SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing is seen, since it may be pale
-REACH_PX = 12.0         # the edge is looked for this far around the first guess
+REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
-RAMP = 0.1
-DISAGREE_PX = 0.9       # what the planes' ends may differ by, beside noise
-FLOOR_PX = 0.12         # what the model of the edge itself is worth
+RAMP = 0.2              # of the length over which an end fades in a plane, that its model is worth there: how opaque it looks depends on the display
+DISAGREE = 3.0          # standard deviations by which the planes' ends may differ
+FLOOR_PX = 0.22         # what the model of the edge itself is worth in a plane
 
 
 def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1) -> np.ndarray:
@@ -140,25 +141,27 @@ class End:
         """m by which the planes differ; 0 where only one shows the end."""
         return float(np.fmax(abs(self.seen_at[0] - self.seen_at[1]), 0.0))
 
-    def disagreed(self, px_per_m: float) -> bool:
-        """Whether the planes differ by more than noise."""
-        return self.apart > 3 * float(np.hypot(*self.seen_sigma)) + DISAGREE_PX / px_per_m
+    @property
+    def disagreed(self) -> bool:
+        """Whether the planes differ by more than they may."""
+        return self.apart > DISAGREE * float(np.hypot(*self.seen_sigma))
 
-    def honest_sigma(self, px_per_m: float) -> float:
+    @property
+    def honest_sigma(self) -> float:
         """sigma in m; where the planes disagree, the truth lies somewhere between."""
-        return float(np.hypot(self.sigma, self.apart / 2)) if self.disagreed(px_per_m) else self.sigma
+        return float(np.hypot(self.sigma, self.apart / 2)) if self.disagreed else self.sigma
 
 
 def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray, outward: np.ndarray, beyond: np.ndarray,
-           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX, blurs_px=BLURS_PX, inner: np.ndarray | None = None) -> list[End]:
+           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX, blurs_px: Sequence[float] = BLURS_PX, inner: np.ndarray | None = None) -> list[End]:
     """Where the device ends, for E ends at once.
 
     s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,) +1 for an end at large s, -1 at
-    small. beyond: (E, 2) m, see `bulge`. ramp: (E, 2) m over which the end fades in each plane; the model is worth RAMP of that.
+    small. beyond: (E, 2) m, see `bulge`. ramp: (E, 2) m over which the end fades in each plane; its model is worth RAMP of that.
     density: strips a px, so many of which are one observation. reach_px: how far from the guess it is looked for.
     inner: (E,) m, how far inside the guess the device is as dark as at its end (`level`); as far as is looked by default.
     Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
-    clipped at 3.5 sigma. Where the planes differ by more than a standard deviation, but do not disagree, each counts by what its edge is worth.
+    clipped at 3.5 sigma. Each plane counts by what its edge is worth, noise and model together.
     """
     e = np.arange(len(s))
     px_per_m = speed[e, :, np.abs(s - guess[:, None]).argmin(axis=1)].mean(axis=1)
@@ -186,29 +189,33 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
         return (slope * slope).sum(axis=2) * weight
 
     both = e[:, None], np.arange(2)
-    floor = (FLOOR_PX / px_per_m) ** 2
-    model = floor + (0.2 * beyond.mean(axis=1)) ** 2 + (RAMP * ramp.max(axis=1)) ** 2
+    model = (FLOOR_PX / px_per_m[:, None]) ** 2 + (0.2 * beyond) ** 2 + (RAMP * ramp) ** 2
     wide = guess[:, None] + np.arange(-reach_px, reach_px + 0.01, COARSE_PX) / px_per_m[:, None]
     cost, a, z = edges(wide, np.broadcast_to(np.reshape(blurs_px, (-1, 1, 1)), (len(blurs_px), len(s), 2)))
     best = cost.min(axis=3).argmin(axis=0)
     cost, a, blur = cost[best, *both], a[best, *both], np.array(blurs_px)[best]
     lowest = cost.argmin(axis=2)
     noise = 1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12)
-    seen_sigma = np.sqrt(noise + model[:, None])
-    trust = 1 / (noise + floor[:, None] + (0.2 * beyond) ** 2 + (RAMP * ramp) ** 2)      # (E, 2), the more foreshortened a plane sees the end, the less
-    fine = wide[e, cost.sum(axis=1).argmin(axis=1)][:, None] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None]
+    seen_sigma = np.sqrt(noise + model)
+    counts = (noise / (noise + model))[:, :, None]      # the more foreshortened a plane sees the end, the less
+    fine = wide[e, (cost * counts).sum(axis=1).argmin(axis=1)][:, None] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None]
     fine_cost, a, z = edges(fine, blur)
-    fine_cost = fine_cost.sum(axis=1)
+    fine_cost = (fine_cost * counts).sum(axis=1)
     k = fine_cost.argmin(axis=1)
-    sigma = np.sqrt(1 / (information(z[e, :, k], a[e, :, k], blur).sum(axis=1) + 1e-12) + model)
+    sigma = (1 / (1 / (information(z[e, :, k], a[e, :, k], blur) + 1e-12) + model)).sum(axis=1) ** -0.5
+    total = cost.sum(axis=1)
+    posterior = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
+    at = np.array([_lowest(f, c) for f, c in zip(fine, fine_cost)])
+    spread = np.sqrt((posterior * (wide - at[:, None])**2).sum(axis=1) / posterior.sum(axis=1))
+    sigma = np.where(spread * px_per_m > COARSE_PX, np.maximum(sigma, spread), sigma)     # in noise the edge may be one of several
     ends = []
     for i in e:
         seen = weight[i] > 0
         if seen.any():
             seen_at = np.array([_lowest(wide[i], c) for c in cost[i]])
-            end = End(_lowest(fine[i], fine_cost[i]), float(sigma[i]), np.where(seen, seen_at, np.nan), np.where(seen, seen_sigma[i], np.nan))
-            if end.apart > np.hypot(*trust[i] ** -0.5) and not end.disagreed(px_per_m[i]):
-                end = replace(end, at=float(trust[i] @ seen_at / trust[i].sum()))      # of two edges the joint one is the sharper, not the better known
+            end = End(float(at[i]), float(sigma[i]), np.where(seen, seen_at, np.nan), np.where(seen, seen_sigma[i], np.nan))
+            if end.apart > np.hypot(*seen_sigma[i]) and not end.disagreed:
+                end = replace(end, at=float(seen_sigma[i]**-2 @ seen_at / (seen_sigma[i]**-2).sum()))      # of two edges the joint one is the sharper, not the better known
             ends.append(end)
         else:
             ends.append(End(float(guess[i]), float('inf'), np.full(2, np.nan), np.full(2, np.nan)))

@@ -6,11 +6,13 @@ are perpendicular and sub-pixel, no correspondence is needed any more, and the n
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
 
+from ...data import View
 from ...geometry.cameras import depth, pixels_per_metre
 from ...geometry.curve import arc_length, middle
 from ...geometry.spline import Spline3, prolong, through
@@ -42,7 +44,6 @@ GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in eithe
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
 CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
-SLANTED = 0.2           # of the length over which an end fades, that its model is worth in the plane that sees it straightest (measured, `wide`)
 HARD_PX = 1.0           # what an end is worth that only one plane shows, or that is hard to see in both
 
 
@@ -54,7 +55,6 @@ class Fit:
     start: float                # m, arc length where the device begins ...
     stop: float                 # ... and where it ends
     end_sigma: np.ndarray       # (2,) m, of those two along the curve
-    end_model: np.ndarray       # (2,) m, what the model of a slanting end is worth, beside that
     open_end: np.ndarray        # (2,) bool: the device leaves the field there
     covariance: np.ndarray      # (3 n, 3 n) m^2 of the control points
     s: np.ndarray               # (N,) m
@@ -67,6 +67,8 @@ class Fit:
     farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, see `_Pair.farther`
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
     moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not come to rest
+    seen_at: np.ndarray | None = None       # (2, 2) m, where the first and the last end (rows) are by plane A, B alone; NaN where one does not tell well
+    seen_sigma: np.ndarray | None = None    # (2, 2) m
 
     def curve(self, count: int) -> np.ndarray:
         """(count, 3) m along the device."""
@@ -141,7 +143,7 @@ class _Pair:
     cleared: list | None    # px, the device's half width in each plane where the line beside it is taken away
 
     @classmethod
-    def of(cls, sheet: Sheet, half_width, step: float, clearing: bool) -> _Pair:
+    def of(cls, sheet: Sheet, half_width: list[float], step: float, clearing: bool) -> _Pair:
         return cls(sheet, step, *_looks(*(round(100 * h) for h in half_width)), half_width if clearing else None)
 
     def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int | None, fine: int, near: bool = False) -> _Seen | None:
@@ -256,7 +258,7 @@ class _Pair:
         return strips, measure(strips, model, within)
 
 
-def _agree(f: Fit, ends: list[End | None], views) -> list[EndRow]:
+def _agree(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> list[EndRow]:
     """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough to say where it ends."""
     rows = []
     for end, by in zip(ends, _shown_by_one(f)):
@@ -286,7 +288,7 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
-def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width, radius) -> tuple[Fit, list[End | None]]:
+def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: list[float], radius: float) -> tuple[Fit, list[End | None]]:
     """The fit, and its ends where they are seen."""
     s, strips, seen, reference, solution = found.layout.s, found.strips, found.measured, found.reference, found.solution
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
@@ -299,16 +301,23 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width, ra
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])     # it runs out of a field before its end
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
     height, inner = _levels(twice(seen.presence), OUTWARD[:, None] * (np.array(reference)[:, None] - s), s[1] - s[0])
-    ends = locate(twice(s), twice(seen.presence) / height[..., None], twice(seen.presence_sigma) / height, twice(strips.speed), np.array(reference), OUTWARD,
-                  *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
-    start_stop = [end.at for end in ends]
+    noise = _noise(seen, found.clutter)
+    located = locate(twice(s), twice(seen.presence) / height[..., None], twice(noise) / height, twice(strips.speed), np.array(reference), OUTWARD,
+                     *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
+    start_stop, ends = [end.at for end in located], list[End | None](located)
     for k in np.nonzero(open_end)[0]:
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
-    return Fit(solution.spline, *start_stop, np.zeros(2), np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
+    start, stop = start_stop
+    return Fit(solution.spline, start, stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
                across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
                np.nan_to_num(found.clutter / middle(seen.usual), nan=1.0), np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
+
+
+def _noise(seen: Measurement, clutter: np.ndarray) -> np.ndarray:
+    """(2,) standard deviation of presence in each plane, as it is averaged along the curve: that of what lies beside the device, where that is more than noise."""
+    return np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual), nan=1e-9))
 
 
 def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray]:
@@ -323,11 +332,11 @@ def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, r
     return bulge(radius, speed, px_per_m, across), radius * np.sqrt(1 - sine**2) / sine
 
 
-def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float, clutter: np.ndarray) -> Fit:
+def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[float], radius: float, clutter: np.ndarray) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
     scale, step, by = np.array(half_width) / radius, f.s[1] - f.s[0], _shown_by_one(f)
-    alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed(1 / step) else -1 for end, v in zip(ends, by)])
-    at = np.array([x if v < 0 else end.seen_at[v] for end, v, x in zip(ends, alone, (f.start, f.stop))])
+    alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1 for end, v in zip(ends, by)])
+    at = np.array([x if end is None or v < 0 else end.seen_at[v] for end, v, x in zip(ends, alone, (f.start, f.stop))])
     window = np.arange(-END_WINDOW_PX, END_WINDOW_PX + END_STEP_PX, END_STEP_PX) * step
     s = at[:, None] + window
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
@@ -335,19 +344,22 @@ def _see_ends(look, f: Fit, ends: list[End | None], half_width, radius: float, c
     there = speed[:, :, len(window) // 2]
     height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
     shape = _shape_of_end(there, scale, f.across, radius)
-    again = locate(s, presence / height[..., None], seen.presence_sigma.reshape(2, 2).T / height, speed, at, OUTWARD, *shape,
+    noise = np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9)      # (planes,)
+    again = locate(s, presence / height[..., None], np.maximum(seen.presence_sigma.reshape(2, 2).T, noise) / height, speed, at, OUTWARD, *shape,
                    density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
     hard, sigma = crowded(f), np.zeros(2)
     for k, (end, v) in enumerate(zip(ends, alone)):
         if v >= 0 and np.isfinite(again[k].seen_at[v]):
             at[k], sigma[k], hard[k] = again[k].seen_at[v], again[k].seen_sigma[v], True
         elif end is not None:
-            at[k], sigma[k] = again[k].at, replace(end, sigma=again[k].sigma).honest_sigma(float(there[k].mean()))
+            at[k], sigma[k] = again[k].at, replace(end, sigma=end.sigma if end.sigma > END_REACH_PX * step else again[k].sigma).honest_sigma
         if end is not None and inner[k] < np.inf:
             further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]), clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
-    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, end_model=SLANTED * shape[1].min(axis=1) * ~f.open_end, alone=alone)
+    told = [(end.seen_at, end.seen_sigma) if end is not None and v < 0 and not h else np.full((2, 2), np.nan) for end, v, h in zip(ends, by, hard)]
+    return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone,
+                   seen_at=np.stack([place for place, _ in told]), seen_sigma=np.stack([unsure for _, unsure in told]))
 
 
 def _shown_by_one(f: Fit) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -18,7 +19,7 @@ NARROW, WIDE = 0.7, 1.6     # times as wide as the device: what such lines are m
 STIFF = 1e-6            # keeps the equations solvable where both look alike
 
 
-def without_neighbours(strips: Strips, half_width_px, keep_px: float) -> Strips:
+def without_neighbours(strips: Strips, half_width_px: Sequence[float], keep_px: float) -> Strips:
     """`strips` cut wide, without the darkest line beside the device in each, and only as far as `keep_px` to either side.
 
     half_width_px: (V,) of the device. Least squares of each strip for a parabola, the device at its place (profile and shift) and the other line where it

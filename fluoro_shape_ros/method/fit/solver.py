@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dpbsv
 
+from ...data import View
 from ...geometry.cameras import projection_jacobian
 from ...geometry.curve import middle
 from ...geometry.spline import Spline3, bending
@@ -59,8 +60,8 @@ class Layout:
         along = (b[:, :, None] * (slope @ spline.control)[:, None, :]).reshape(-1, BAND)[at[:, ::4]] * (there[:, ::4, None] / SLIDE)
         prior = _sum(band, along.transpose(0, 2, 1) @ along, 3 * n)
         prior[0] += FLOOR
-        for k in range(4):
-            prior[3 * k, :3 * (n - k)] += np.repeat(np.diagonal(stiffness, k), 3)
+        for j in range(4):
+            prior[3 * j, :3 * (n - j)] += np.repeat(np.diagonal(stiffness, j), 3)
         return cls(s, basis, slope, b, at, there, unknowns, band, stiffness, prior)
 
     def matrix(self, blocks: np.ndarray) -> np.ndarray:
@@ -104,7 +105,7 @@ class EndRow:
         return np.stack([np.append(np.diagonal(full, k), np.zeros(k)) for k in range(BAND)])
 
     @classmethod
-    def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray, views) -> EndRow:
+    def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray, views: Sequence[View]) -> EndRow:
         """From where along the curve, m, each plane (2,) sees the device end.
 
         A curve that runs in an epipolar plane is seen across itself by neither plane; only its ends tell its depth. Moved by dX at its end, plane v
@@ -123,7 +124,8 @@ class EndRow:
         return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
 
 
-def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views, within: np.ndarray, ends: Sequence[EndRow] = (), near: bool = True) -> Solution:
+def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views: Sequence[View], within: np.ndarray, ends: Sequence[EndRow] = (),
+          near: bool = True) -> Solution:
     """One Gauss-Newton step. `ends`: what else must hold. near: the curve lies on the device already, so that what is far off is not it.
 
     Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's biweight); prior: third

@@ -85,7 +85,7 @@ def _distance_across(signed: np.ndarray, axis: int) -> np.ndarray:
     return d
 
 
-def _fill(gain: np.ndarray, step_a, step_b) -> np.ndarray:
+def _fill(gain: np.ndarray, step_a: np.ndarray, step_b: np.ndarray) -> np.ndarray:
     """(..., S, S) best score of an alignment that ends at each pair of samples; rows one after another, all pairs of curves at once."""
     total = np.zeros_like(gain)
     before = np.zeros(gain.shape[:-2] + (gain.shape[-1],), gain.dtype)
@@ -112,5 +112,5 @@ def _trace(total: np.ndarray, gain: np.ndarray, length_a: float, length_b: float
             break
         i, j = i - (k != 2), j - (k != 1)
         path.append((i, j))
-    path = np.array(path[::-1], float)
-    return path[:, 0], path[:, 1]
+    along = np.array(path[::-1], float)
+    return along[:, 0], along[:, 1]

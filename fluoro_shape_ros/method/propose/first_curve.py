@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.interpolate import BSpline
 
+from ...data import View
 from ...geometry.cameras import depth, isocenter
 from ...geometry.curve import arc_length
 from ...geometry.spline import bending
@@ -13,7 +16,7 @@ from .alignment import Alignment
 ALONG = 0.3             # correspondences along the curve count this much of what is seen across it
 
 
-def first_curve(views, a_px: np.ndarray, b_px: np.ndarray, alignment: Alignment) -> np.ndarray:
+def first_curve(views: Sequence[View], a_px: np.ndarray, b_px: np.ndarray, alignment: Alignment) -> np.ndarray:
     """(M, 3) points in m along the device, from its two undistorted centrelines (N, 2) and (K, 2) and how they correspond.
 
     Each image point u gives the equations (P_1 - u P_3) X = 0 (HZ 12.2), turned across and along the centreline.

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from ...data import View
 from ...geometry.cameras import pixels_per_metre
 from ...geometry.curve import arc_length, middle
 from ...geometry.spline import through
@@ -32,7 +33,7 @@ SHORTEST = 0.6          # share of the strips ...
 SEEN = 0.93             # ... and how many of these must be clear, for a path that is worth a try
 
 
-def reach_px(guess: Guess, view) -> float:
+def reach_px(guess: Guess, view: View) -> float:
     """How far from the projected guess the image is looked at."""
     return WITHIN * float(guess.sigma.max()) * pixels_per_metre(view.P, guess.points) + BEYOND_PX + 50
 

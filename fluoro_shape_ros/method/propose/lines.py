@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from ...data import View
 from ...geometry.cameras import fundamental, isocenter, pixels_per_metre, undistort
 from ...imaging.lines import Candidate, find_candidates
 from ...imaging.oriented import along_lines
@@ -44,16 +45,16 @@ def candidates(sheet: Sheet, radius: float, min_length_px: float, faint: bool) -
     """The most device-like lines of each plane, best first; `faint` ones are averaged along themselves, which takes longer."""
     center = isocenter(sheet.views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in sheet.views]
-    return both(lambda *plane: _candidates(*plane, min_length_px, faint), sheet.planes, sheet.fields, widths, pixels=sum(p.size for p in sheet.planes))
+    return both(lambda image, field, width: _candidates(image, field, width, min_length_px, faint), sheet.planes, sheet.fields, widths, pixels=sum(p.size for p in sheet.planes))
 
 
-def by_lines(views, found: tuple[list[Candidate], list[Candidate]]) -> Iterator[Hypothesis]:
+def by_lines(views: Sequence[View], found: tuple[list[Candidate], list[Candidate]]) -> Iterator[Hypothesis]:
     """One for a line of each plane that may be the same device, most likely first; the other direction only where that fits about as well."""
     if not all(found):
         return
     curves = [[undistort(v, c.points_px) for c in lines] for v, lines in zip(views, found)]
-    scores = {}
-    for alignment in align(*curves, [np.array([c.score for c in lines]) for lines in found], fundamental(views[0].P, views[1].P), best=ALIGNMENTS):
+    scores: dict[tuple[int, int], float] = {}
+    for alignment in align(curves[0], curves[1], [np.array([c.score for c in lines]) for lines in found], fundamental(views[0].P, views[1].P), best=ALIGNMENTS):
         a, b = alignment.a, alignment.b
         if alignment.score >= FLIPPED * scores.setdefault((a, b), alignment.score):
             yield Hypothesis(first_curve(views, curves[0][a], curves[1][b], alignment), (found[0][a], found[1][b]))
