@@ -52,6 +52,7 @@ setup(
     maintainer='fluoro_shape_ros maintainers',
     maintainer_email='maintainers@fluoro-shape.example',
     license='Apache-2.0',
+    classifiers=[f'Programming Language :: Python :: 3.{minor}' for minor in (11, 12, 13)],     # with which .ci/run tests
     keywords=['ROS', 'fluoroscopy', 'continuum robot', 'shape sensing'],
     packages=find_packages(include=[f'{NAME}*', 'msg_adapters*']),
     data_files=[

@@ -85,8 +85,7 @@ def answered(moment: Moment, config: Config, memory: Memory, time_budget: float,
     answer = dataclasses.replace(answer_of(Case(moment.scene, note=stream.said(), kind=stream.kind), result, moment.shown), cpu_s=cpu_s)
     if result.shape is None:
         return Pair(answer, seconds)
-    truth = moment.scene.truth
-    return Pair(answer, seconds, result.shape.tip - truth[-1], float(distance_to(result.shape.points, truth).max()))
+    return Pair(answer, seconds, result.shape.tip - moment.whole[-1], float(distance_to(result.shape.points, moment.whole).max()))
 
 
 def _take_mask(stream: Stream, memory: Memory, frames: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from ..data import Landmarks, Reconstruction, View
 from ..geometry.cameras import epipolar_lines, fundamental
 
-FALSE_ALARM = 1e-3      # share of the runs with right calibrations, by the model, in which it cries
+FALSE_ALARM = 1e-2      # share of the runs with right calibrations in which it cries, at most, by the model (drawn from that: 1 of 1800)
 RATHER = 0.5            # confidence of a curve, refused or not, from which on its landmarks count
 BLOCK = 5               # landmarks of a kind, successive ones, of which the middle one counts: some are wrong ...
 TOGETHER = 2            # ... and as they look alike, it is worth no more than so many of them

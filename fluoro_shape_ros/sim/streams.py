@@ -50,6 +50,7 @@ class Moment:
 
     scene: Scene
     shown: bool         # whether both images show the device
+    whole: np.ndarray   # (N, 3) m, base to tip, with what lies outside the fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Stream:
                         for d, last, off, chain in zip(detected, averaged, dark, self.run.chains)]     # it begins anew once there are X-rays again
             shown = self.run.shown(tuple(np.zeros_like(d) if a is None else a for d, a in zip(detected, averaged)), round(k / self.rate * 1e9))
             truth = placement.seen_in_both(whole, self.run.fields)
-            yield Moment(Scene(shown, truth, self.run.radius, truth[0], self.kind, self.run.seed), not any(dark))
+            yield Moment(Scene(shown, truth, self.run.radius, truth[0], self.kind, self.run.seed), not any(dark), whole)
 
     def mask(self, count: int) -> list[Frame]:
         """`count` pairs without the device, taken MASK_AGE_S before the stream begins; none where this kind has no mask."""

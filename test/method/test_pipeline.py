@@ -387,7 +387,7 @@ def test_a_search_that_is_cut_short_goes_on_with_the_next_pair(scene, config, an
         prior, turns = Prior(search=result.search), turns + 1
         assert turns < 50
     assert turns >= 2 and result.search is None
-    assert cKDTree(answer.shape.points).query(result.shape.points)[0].max() < SAME
+    assert cKDTree(answer.shape.points).query(result.shape.points)[0].max() < ROUNDING
 
 
 def test_the_device_is_looked_for_where_it_was_however_late_it_is(scene, config, answer):

@@ -21,7 +21,7 @@ REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
-RAMP = 0.2              # of the length over which an end fades in a plane, that its model is worth there: how opaque it looks depends on the display
+RAMP = 0.3              # of the length over which an end fades in a plane, that its model is worth there: how opaque it looks depends on the display
 DISAGREE = 3.0          # standard deviations by which the planes' ends may differ
 FLOOR_PX = 0.22         # what the model of the edge itself is worth in a plane
 
