@@ -18,6 +18,7 @@ from ..geometry.curve import middle
 from ..imaging.strips import lay_out
 from .fit.fit import Fit
 
+FAR_PX = 10.0           # from the fit's end: there a plane hardly looked for it, and found something else
 AROUND = 13             # strips, that tell how far the device lies beside the curve
 ALONG_LINE = 0.15       # sine of the angle to its epipolar line, up to which the device runs along it ...
 SHORTEST = 6            # ... for so many strips
@@ -46,6 +47,8 @@ def _ends(f: Fit, views: Sequence[View], tip_is_last: bool) -> Iterator[Place]:
         if f.seen_at is None or f.seen_sigma is None or not np.isfinite([f.seen_at[k], f.seen_sigma[k]]).all():
             continue
         centers, normals, speed = lay_out(views, *f.spline.lines(f.seen_at[k]))       # strip v where plane v sees the end
+        if (np.abs(f.seen_at[k] - (f.start, f.stop)[k]) * np.diag(speed) > FAR_PX).any():
+            continue
         near = np.argsort(np.abs(f.s - np.clip(f.seen_at[k].mean(), f.start, f.stop)))[:AROUND]
         a, b = (centers[v, v] + normals[v, v] * _usual(f.offset_px[near, v]) for v in (0, 1))
         yield 'tip' if k == int(tip_is_last) else 'base', a, b, outward * _tangents(normals[1, 1]) * speed[1, 1] * np.hypot(*f.seen_sigma[k])

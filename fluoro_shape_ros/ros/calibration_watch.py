@@ -26,7 +26,7 @@ PLACE_PX = 0.1          # what a landmark is worth at best
 KINDS = 'tip', 'base', 'steps', 'bend'
 # What may be wrong, and its typical size where it is: px, rad, rad, a share; where it is not it is as good as calibrations are
 WRONG = {'shifted': (3.0, 0.1), 'turned a': (0.03, 3.5e-4), 'turned b': (0.03, 3.5e-4), 'scaled': (0.02, 4e-4)}
-BIAS = 0.6, 0.6, 0.6, 0.15      # of each kind, in its own standard deviations (measured: 0.5 to 0.7); of a bend px
+BIAS = 0.5, 0.5, 0.5, 0.15      # of each kind, in its own standard deviations (measured: 0.3 to 0.5); of a bend px
 EVEN = np.log(20)       # log odds from which on one explanation is better than another
 
 
