@@ -1,6 +1,10 @@
 """What tests share."""
 
+import os
 import signal
+
+# as the package sets it, which tests that load numpy first would miss: with more threads BLAS rounds otherwise than other processes
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import pytest
 
