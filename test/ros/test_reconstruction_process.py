@@ -164,33 +164,34 @@ def test_it_ends_with_the_process_that_began_it_even_where_it_hangs():
     assert until(lambda: gone(pid))
 
 
-def good_here(reconstructor):
-    """Whether a good pair is answered though there is no other process."""
-    others = reconstructing_for(os.getpid())
-    return reconstructor(frame(GOOD), CONFIG).outcome is Outcome.OK and reconstructing_for(os.getpid()) == others
+@pytest.fixture
+def answered_here():
+    """Whether a good pair is answered though there is no process but the ones before."""
+    others = reconstructing_for(os.getpid())    # before one is begun that may take its time to end
+    return lambda reconstructor: reconstructor(frame(GOOD), CONFIG).outcome is Outcome.OK and reconstructing_for(os.getpid()) == others
 
 
 @pytest.mark.parametrize('program, why, told', [
     ('/bin/false', '3 processes ended before they were ready', ['it ended with exit code 1'] * 3),
     ('/no/such/python', 'no process can be begun', []),
 ])
-def test_where_no_process_gets_ready_this_one_does_the_work(monkeypatch, program, why, told):
+def test_where_no_process_gets_ready_this_one_does_the_work(monkeypatch, answered_here, program, why, told):
     monkeypatch.setattr(sys, 'executable', program)
     with Reconstructor() as reconstructor:
         reasons = []
         reconstructor.told = reasons.append
-        assert good_here(reconstructor) and why in reconstructor.here
+        assert answered_here(reconstructor) and why in reconstructor.here
     # the first one may end before anybody is there to be told
     assert len(told) - 1 <= len(reasons) <= len(told) and all(reason.startswith(start) for reason, start in zip(reasons, told))
 
 
-def test_where_there_is_one_core_this_process_does_the_work(monkeypatch):
+def test_where_there_is_one_core_this_process_does_the_work(monkeypatch, answered_here):
     monkeypatch.setattr(os, 'sched_getaffinity', lambda _: {0})
     with Reconstructor() as reconstructor:
-        assert good_here(reconstructor) and reconstructor.here == 'there is one core only'
+        assert answered_here(reconstructor) and reconstructor.here == 'there is one core only'
 
 
-def test_where_there_is_no_nameless_memory_this_process_does_the_work(monkeypatch):
+def test_where_there_is_no_nameless_memory_this_process_does_the_work(monkeypatch, answered_here):
     monkeypatch.delattr(os, 'memfd_create')
     with Reconstructor() as reconstructor:
-        assert good_here(reconstructor) and 'memfd_create' in reconstructor.here
+        assert answered_here(reconstructor) and 'memfd_create' in reconstructor.here
