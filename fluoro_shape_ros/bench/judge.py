@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from ..config import Config
 from ..geometry.cameras import isocenter, pixels_per_metre
-from ..imaging.field import field_of_view
+from ..imaging.field import common_field
 from ..imaging.mask import subtract
 from ..imaging.prepare import sheet_of
 from ..method.features import MEAN, MEAN_PX, NAMES, TIP, TIP_PX, at_first_sight, features
@@ -69,7 +69,7 @@ def gather(task: Task) -> Curves:
     frame, config = scene.frame, Config.from_values(robot_radius=scene.radius, base_position=scene.base_position.tolist())
     cv2.setNumThreads(1)
     images = frame.images if case.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, case.masks))
-    fields = [field_of_view(image) for image in frame.images]
+    fields = [common_field(image, mask) for image, mask in zip(frame.images, case.masks or (None, None))]
     sheet = sheet_of(images, fields, frame.views, config.detection.polarity)
     order = lambda f: tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config, None)[0]     # noqa: E731
     model = load()

@@ -7,55 +7,32 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-SHRINK = 4              # the field is found at a quarter of the resolution: two halvings
-DARK = 0.12, 0.07, 0.04, 0.02   # darker than this share of the bright level counts as not exposed, the first for which the rest is convex ...
-BRIGHT = 0.95           # ... which this share of the pixels does not exceed
-OPENING = 9             # small-image px: a device is thinner, a blade is wider
-CONVEX = 0.975          # share of its convex hull that a field fills: blades and an intensifier leave a convex one open, dense anatomy does not
+from .collimation import outlines
+
+SMALLEST_PX = 100       # of an image's smaller side, to which it may be halved again and again: blades are wide
+MOST = 2**16            # pixels that edges are looked for in
+SHRINK = 4              # distances from its border are known to so many px
 
 
 def field_of_view(image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 mask, 255 where the (H, W) image is exposed.
-
-    Unexposed is what is dark, wider than any device and connected with the image's border, if what it leaves is convex.
-    """
+    """(H, W) uint8 mask, 255 where the (H, W) image is exposed."""
     h, w = image.shape
     small = image
-    for _ in range(2):      # OpenCV is many times faster at halving
+    while min(small.shape) >= 2 * SMALLEST_PX or small.size > MOST:     # OpenCV is many times faster at halving
         small = cv2.resize(small, (-(-small.shape[1] // 2), -(-small.shape[0] // 2)), interpolation=cv2.INTER_AREA)
-    small = small.astype(np.float32)
-    small -= min(0.0, float(small.min()))
-    some = small.ravel()[::7]
-    bright = np.partition(some, int(BRIGHT * len(some)))[int(BRIGHT * len(some))]
-    for share in DARK:
-        blocked = _blocked(small < share * bright)
-        if blocked is None:
-            break
-        if _is_convex(~blocked):
-            return cv2.resize((~blocked).astype(np.uint8) * 255, (w, h), interpolation=cv2.INTER_NEAREST)
-    return _open(h, w)
+    found = outlines(small.astype(np.float32))
+    if not found:
+        return _open(h, w)
+    field, scale = np.full((h, w), 255, np.uint8), (w / small.shape[1], h / small.shape[0])
+    for outline in found:
+        outline.draw(field, scale)
+    return field
 
 
-def _blocked(dark: np.ndarray) -> np.ndarray | None:
-    """(h, w) bool: what of the (h, w) `dark` is wide and connected with the border; None where nothing is."""
-    if not dark.any():
-        return None
-    framed = cv2.copyMakeBorder(dark.astype(np.uint8), OPENING, OPENING, OPENING, OPENING, cv2.BORDER_REPLICATE)
-    framed = cv2.morphologyEx(framed, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OPENING, OPENING)))
-    _, labels = cv2.connectedComponents(framed[OPENING:-OPENING, OPENING:-OPENING])
-    outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    blocked = np.isin(labels, outside[outside > 0])
-    return blocked if blocked.any() else None
-
-
-def _is_convex(lit: np.ndarray) -> bool:
-    """Whether an (h, w) bool region fills its convex hull."""
-    v, u = np.nonzero(lit)
-    if not len(u):
-        return False
-    hull = np.zeros(lit.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([u, v], axis=1).astype(np.int32)), 1)
-    return bool(len(u) > CONVEX * np.count_nonzero(hull))
+def common_field(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """(H, W) uint8, 255 where an image is exposed, and the mask that is taken off it (None: none) was: blades may have moved since."""
+    field = field_of_view(image)
+    return field if mask is None else cv2.min(field, field_of_view(mask))
 
 
 @lru_cache(8)

@@ -13,7 +13,7 @@ from ..config import Config
 from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape, View
 from ..geometry.cameras import GeometryError, check, distort, pixels_per_metre, project, undistort
 from ..geometry.curve import arc_length, distance_to, resample
-from ..imaging.field import border_distance, field_of_view
+from ..imaging.field import border_distance, common_field
 from ..imaging.mask import subtract
 from ..imaging.parallel import both
 from ..imaging.prepare import dark_device, sheet_of, silhouettes
@@ -53,7 +53,7 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: flo
         by = by if by is _by_paper else partial(by, measured=partial(on_outlines, outlines, radius=config.radius))
     else:
         images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
-        fields = both(field_of_view, frame.images, pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
+        fields = both(common_field, frame.images, prior.masks or (None, None), pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
     clock.lap('prepare')
     guess, why = look(prior, frame.views, config.curve.prior_sigma)
     return judged(_in_time(by(frame, images, fields, config, prior, guess, clock), clock), guess, why)

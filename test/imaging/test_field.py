@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.imaging.field import border_distance, field_of_view
+from fluoro_shape_ros.imaging.field import border_distance, common_field, field_of_view
 
 
 def test_a_plain_image_is_all_field():
@@ -112,3 +112,31 @@ def test_distance_to_the_border():
     image[:, :40] = 5
     d = border_distance(field_of_view(image), np.array([[100.0, 100], [239, 100], [150, 195], [60, 100]]))
     assert_allclose(d, [60, 0, 4, 20], atol=6)
+
+
+DISPLAYS = {'linear': lambda x: x, 'logarithmic': lambda x: np.log1p(40 * x) / np.log(41), 'gamma': lambda x: x**0.5, 'windowed': lambda x: np.clip(2 * x - 0.3, 0, 1)}
+
+
+@pytest.mark.parametrize('display', DISPLAYS)
+@pytest.mark.parametrize('name', ['four blades', 'an intensifier', 'an intensifier with a blade'])
+def test_scatter_beyond_the_blades_hides_them_on_no_display(name, display):
+    """Two fifths of what is bright inside goes on as a glow outside, as scatter does."""
+    dark = OPENINGS[name]
+    primary = np.where(dark, 0.0, 0.9 - 0.4 * np.exp(-((U - 110) / 60.0)**2 - ((V - 150) / 50.0)**2))
+    light = 0.6 * primary + 0.4 * cv2.GaussianBlur(primary, (0, 0), 25)
+    counted = np.random.default_rng(3).poisson(2000 * light) / 2000
+    assert_found(field_of_view(np.clip(255 * DISPLAYS[display](np.clip(counted, 0, 1)), 0, 255).astype(np.uint8)), dark)
+
+
+def test_letters_beyond_the_blades_are_not_the_patient():
+    dark = OPENINGS['four blades']
+    image = cv2.resize(np.where(dark, 4, 180 - 0.1 * U).astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+    cv2.putText(image, 'L  12 mA', (20, 50), cv2.FONT_HERSHEY_PLAIN, 2, 255, 2)
+    assert_found(field_of_view(image), np.kron(dark, np.ones((4, 4), bool)))
+
+
+def test_where_a_blade_stood_when_the_mask_was_taken_is_not_exposed():
+    image, mask = (np.where(U < edge, 4, 180).astype(np.uint8) for edge in (50, 70))
+    assert_found(common_field(image, mask.astype(np.float32)), U < 70)
+    assert_found(common_field(mask, image.astype(np.float32)), U < 70)
+    assert_found(common_field(image, None), U < 50)
