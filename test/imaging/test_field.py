@@ -114,7 +114,7 @@ def test_distance_to_the_border():
     assert_allclose(d, [60, 0, 4, 20], atol=6)
 
 
-DISPLAYS = {'linear': lambda x: x, 'logarithmic': lambda x: np.log1p(40 * x) / np.log(41), 'gamma': lambda x: x**0.5, 'windowed': lambda x: np.clip(2 * x - 0.3, 0, 1)}
+DISPLAYS = {'linear': lambda x: x, 'logarithmic': lambda x: np.log1p(15 * x) / np.log(16), 'gamma': lambda x: x**0.5, 'windowed': lambda x: np.clip(2 * x - 0.3, 0, 1)}
 
 
 @pytest.mark.parametrize('display', DISPLAYS)
