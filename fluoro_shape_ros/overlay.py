@@ -17,7 +17,7 @@ from .geometry.cameras import depth, distort, epipolar_lines, fundamental, proje
 from .geometry.curve import arc_length, at_arc_length
 
 SEEN, FOUND, TIP, EPIPOLAR = '#ffb347', '#2ad4ff', '#ff5a5f', '#c58bff'
-GOOD, REJECTED, WORDS = '#5ee07a', '#ffb347', '#ffffff'
+GOOD, REJECTED, WORDS = '#5ee07a', '#ff7ac6', '#ffffff'
 CONFIDENCE = 0.95       # of the tip's ellipse
 END_PX = 15.0           # an end of a centreline this near to the reprojected tip is where its plane sees the tip
 INSET = 0.25            # side of the magnified surroundings of the tip, share of the image's shorter side

@@ -9,10 +9,13 @@ import numpy as np
 
 from ..data import View
 from ..geometry.cameras import crop, distort, isocenter, pixels_per_metre, project
+from .field import field_of_view
 from .parallel import both
 from .silhouette import outline, shadow
 from .strips import Sheet
 
+FINE_PX, LOCAL_PX, AROUND_PX = 1.25, 25, 61     # of an image of half the size: what a device is wider than, what it is thinner than, how far around it is compared
+RARE = 8.0              # standard deviations: what deviates by more counts as if by so many
 REGION_PX = 80          # a tracked device moves and grows less than this from one pair to the next
 WHOLE = slice(None), slice(None)    # rows and columns of an image
 
@@ -25,10 +28,22 @@ def dark_device(image: np.ndarray, polarity: str) -> np.ndarray:
         low, high = float(image.min()), float(image.max())
         image, full = image - min(low, 0.0), high - min(low, 0.0)
     if polarity == 'auto':
-        # a thin device is a rare deviation from the local level: the longer tail tells its sign
-        detail = image - cv2.blur(image, (31, 31))
-        polarity = 'bright' if np.mean(detail**3) > 0 else 'dark'
+        polarity = 'bright' if _is_bright(image) else 'dark'
     return full - image if polarity == 'bright' else image
+
+
+def _is_bright(image: np.ndarray) -> bool:
+    """Whether the thin things that stand out most in an (H, W) float32 image are brighter than what lies around them.
+
+    What deviates from the local level counts in local standard deviations, so that neither blades nor bright parts of the patient outweigh a device.
+    """
+    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    field = cv2.min(field_of_view(small), field_of_view(small.max() - small))
+    field = cv2.erode(field, np.ones((LOCAL_PX, LOCAL_PX), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=255)
+    detail = cv2.GaussianBlur(small, (0, 0), FINE_PX)
+    detail -= cv2.blur(detail, (LOCAL_PX, LOCAL_PX))
+    usual = np.sqrt(np.maximum(cv2.blur(detail * detail, (AROUND_PX, AROUND_PX)), 1e-12))
+    return bool(np.sum(np.clip(detail / usual, -RARE, RARE)[field > 0]**5) > 0)
 
 
 def stable_noise(image: np.ndarray, polarity: str, region: tuple[slice, slice], out: np.ndarray) -> None:

@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.imaging.field import border_distance, common_field, field_of_view
+from fluoro_shape_ros.imaging.prepare import dark_device
 
 
 def test_a_plain_image_is_all_field():
@@ -140,3 +141,15 @@ def test_where_a_blade_stood_when_the_mask_was_taken_is_not_exposed():
     assert_found(common_field(image, mask.astype(np.float32)), U < 70)
     assert_found(common_field(mask, image.astype(np.float32)), U < 70)
     assert_found(common_field(image, None), U < 50)
+
+
+@pytest.mark.parametrize('name', [None, *OPENINGS])
+def test_blades_and_bones_do_not_tell_a_bright_device_from_a_dark_one(name):
+    rng = np.random.default_rng(7)
+    light = 150 - 60 * np.exp(-((U - 160) / 25.0)**2)       # a spine
+    light = light + np.where(np.abs((V % 60) - 30) < 5, 25, 0) * (np.abs(U - 160) < 40)
+    light[np.abs(V - 128 - 12 * np.sin(U / 25.0)) < 2] -= 30        # the device
+    dark = np.zeros(light.shape, bool) if name is None else OPENINGS[name]
+    image = np.clip(np.where(dark, 4, light) + rng.normal(0, 2, light.shape), 0, 255).astype(np.uint8)
+    assert (dark_device(image, 'auto') == image).all()
+    assert (dark_device(255 - image, 'auto') == image).all()
