@@ -14,13 +14,14 @@ MOST = 2**16            # pixels that edges are looked for in
 SHRINK = 4              # distances from its border are known to so many px
 
 
-def field_of_view(image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 mask, 255 where the (H, W) image is exposed."""
+def field_of_view(image: np.ndarray, polarity: str = 'dark') -> np.ndarray:
+    """(H, W) uint8 mask, 255 where the (H, W) image is exposed; what is not is the brighter side where the device is `bright`, either where that is `auto`."""
     h, w = image.shape
     small = image
     while min(small.shape) >= 2 * SMALLEST_PX or small.size > MOST:     # OpenCV is many times faster at halving
         small = cv2.resize(small, (-(-small.shape[1] // 2), -(-small.shape[0] // 2)), interpolation=cv2.INTER_AREA)
-    found = outlines(small.astype(np.float32))
+    small = small.astype(np.float32)
+    found = [o for bright in (False, True) if polarity in ('auto', ('dark', 'bright')[bright]) for o in outlines(small.max() - small if bright else small)]
     if not found:
         return _open(h, w)
     field, scale = np.full((h, w), 255, np.uint8), (w / small.shape[1], h / small.shape[0])
@@ -29,10 +30,10 @@ def field_of_view(image: np.ndarray) -> np.ndarray:
     return field
 
 
-def common_field(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+def common_field(image: np.ndarray, mask: np.ndarray | None, polarity: str = 'dark') -> np.ndarray:
     """(H, W) uint8, 255 where an image is exposed, and the mask that is taken off it (None: none) was: blades may have moved since."""
-    field = field_of_view(image)
-    return field if mask is None else cv2.min(field, field_of_view(mask))
+    field = field_of_view(image, polarity)
+    return field if mask is None else cv2.min(field, field_of_view(mask, polarity))
 
 
 @lru_cache(8)

@@ -53,7 +53,8 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: flo
         by = by if by is _by_paper else partial(by, measured=partial(on_outlines, outlines, radius=config.radius))
     else:
         images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
-        fields = both(common_field, frame.images, prior.masks or (None, None), pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
+        fields = both(partial(common_field, polarity=config.detection.polarity), frame.images, prior.masks or (None, None),
+                      pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
     clock.lap('prepare')
     guess, why = look(prior, frame.views, config.curve.prior_sigma)
     return judged(_in_time(by(frame, images, fields, config, prior, guess, clock), clock), guess, why)

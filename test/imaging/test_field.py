@@ -66,6 +66,14 @@ def test_a_convex_opening_is_found(name):
     assert_found(blocked_where(OPENINGS[name]), OPENINGS[name])
 
 
+@pytest.mark.parametrize('name', OPENINGS)
+def test_on_an_inverted_display_the_bright_side_is_not_exposed(name):
+    image = 255 - np.where(OPENINGS[name], 4, 180 - 0.1 * U).astype(np.uint8)
+    for polarity in ('bright', 'auto'):
+        assert_found(field_of_view(image, polarity), OPENINGS[name])
+    assert (field_of_view(image) == 255).all()
+
+
 @pytest.mark.parametrize('turn_deg', [5, 20, 45])
 def test_blades_may_be_turned(turn_deg):
     v, u = np.mgrid[0:768, 0:768] - 383.5
