@@ -20,6 +20,7 @@ from ..imaging.prepare import dark_device, sheet_of, silhouettes
 from ..imaging.strips import Sheet
 from . import judge, paper
 from .backbone import backbone
+from .continuity import continuity
 from .features import MEAN, MEAN_PX, TIP, TIP_PX, at_first_sight, features
 from .fit.fit import Fit, fit
 from .known_device import ALIKE, CONTRADICTS, Likeness, likeness, verdict
@@ -72,12 +73,14 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     model = judge.load()
 
     def sized_up(sheet: Sheet, f: Fit) -> tuple[np.ndarray, float, bool]:
-        """Features of a fit and its log odds, with what a prediction that it bears out and the device's description say; and whether its last end is the tip."""
+        """Features of a fit and its log odds, with what a prediction that it bears out, the device's description and where it was say; and whether its last
+        end is the tip."""
         alike = _alike(f.curve(CURVE), sheet, config)
         last, _ = tip(f, alike)
         seen = features(f, sheet, radius, last)
         predicted = judge.PREDICTED if guess is not None and borne_out(f.curve(100), guess) else 0.0
-        return seen, float(model.log_odds(seen)) + predicted + verdict(config.described, alike, f, last)[0], last
+        was = continuity(f.curve(100)[::1 if last else -1], prior, frame.stamp_ns)
+        return seen, float(model.log_odds(seen)) + predicted + verdict(config.described, alike, f, last)[0] + was, last
 
     lines: Sequence[np.ndarray | None] = ()
     leads, chosen, unfinished = [], None, None
@@ -116,6 +119,8 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     against, words = verdict(config.described, alike, f, last, config.detection.device)
     if against > min(CONTRADICTS, model.terms(chosen.features).min()):
         words = model.why(chosen.features, chosen.log_odds, p)
+    if continuity(f.curve(100)[::1 if last else -1], prior, frame.stamp_ns) < min(model.terms(chosen.features).min(), against):
+        words = 'it is far from where it was just before'
     if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)
     shape, places = backbone(f, frame.views, last, config.curve.backbone_spacing), landmarks(f, frame.views, last)
