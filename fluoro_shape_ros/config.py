@@ -1,4 +1,4 @@
-"""Every parameter once: default, unit, range and description. ROS parameters and README are made from here."""
+"""Every parameter once: default, unit, range and description. ROS parameters and docs/parameters.md are made from here."""
 
 from __future__ import annotations
 
