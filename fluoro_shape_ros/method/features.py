@@ -22,6 +22,7 @@ PAST = 18               # strips looked at past either end
 CLEAR = 2.5             # signal to noise, at which a block is darker than nearly all places beside the curve
 MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose closest-point mean is within the larger of these ...
 TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
+PARTS, FEW = 3, 3       # of a device that are looked at apart for its width, of so many blocks at least
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
 FARTHEST = 12.0         # nats, in the same way
 BY_CHANCE = 2.0         # deviations, that the darkest of some places beside the device stands out by
@@ -35,7 +36,7 @@ class Features:
     weakest: float      # ln of the lowest signal to noise of three blocks in a row
     seen: float         # share of the blocks darker than nearly all places beside the curve
     symmetric: float    # odd part of the mean profile, as a share of its even part
-    wide: float         # ln of the width seen to that expected, where it is wider ...
+    wide: float         # ln of the width seen to that expected, of the part where that is nearest to none, where it is wider ...
     narrow: float       # ... and the other way round
     residual: float     # px rms, of the device from the curve
     sigma: float        # ln of the curve's, as a share of what it may be off by
@@ -128,16 +129,23 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, bl
     curve = np.vander(x, 3)
     mean = profiles[PAST:PAST + number * block].reshape(number, block, -1).mean(axis=1)
     shadow = (mean[:, flank] @ np.linalg.pinv(curve[flank]).T @ curve.T - mean)[:, near]
-    even, even_error = _typical(0.5 * (shadow + shadow[:, ::-1]))
+    even, _ = _typical(0.5 * (shadow + shadow[:, ::-1]))
     odd, odd_error = _typical(0.5 * (shadow - shadow[:, ::-1]))
-    positive = even * (even > 2 * even_error)
-    # a cylinder's chords have a standard deviation of half its radius
-    seen_width = np.sqrt((positive * x[near]**2).sum() / (positive.sum() + 1e-12)) / np.hypot(radius_px / 2, BLUR_PX)
+    # tubes that end make steps: the part that comes nearest to the radius counts
+    parts = np.array_split(shadow, PARTS) if number >= PARTS * FEW else [shadow]
+    width = min((_width(p, x[near]) / np.hypot(radius_px / 2, BLUR_PX) for p in parts), key=lambda w: abs(np.log(max(w, 1e-3))))
     each = dark[:, np.abs(x) <= 1].max(axis=1) / usual
     ends = [(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()), (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())]
     odd_share = np.sqrt(max((odd**2 - odd_error**2).sum(), 0.0) / ((even**2).sum() + 1e-12))
-    return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0), width=float(np.log(np.clip(seen_width, 0.3, 3.0))),
+    return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0), width=float(np.log(np.clip(width, 0.3, 3.0))),
                 stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))
+
+
+def _width(shadow: np.ndarray, x: np.ndarray) -> float:
+    """Standard deviation in px of the shadows (N, W) at (W,) offsets, as far as they are clear; a cylinder's chords have half its radius."""
+    even, error = _typical(0.5 * (shadow + shadow[:, ::-1]))
+    positive = even * (even > 2 * error)
+    return float(np.sqrt((positive * x**2).sum() / (positive.sum() + 1e-12)))
 
 
 def _typical(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
