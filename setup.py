@@ -21,10 +21,11 @@ EXECUTABLES = {
 # real ROS 2 Jazzy as wheels; where ROS is installed (or there are no wheels) the extra is empty
 WHEELS = '; sys_platform == "linux" and platform_machine == "x86_64"'
 EXTRAS = {
-    'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp')],
+    'ros': [f'{name}{WHEELS}' for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces',
+                                           'ros-jazzy-rmw-fastrtps-cpp')],
     'bags': ['rosbags>=0.10', 'mcap>=1.2', 'zstandard>=0.22', 'pyyaml>=6.0'],
     'report': ['plotly>=5.18'],
-    'dicom': ['pydicom>=3.0.1', 'python-gdcm>=3.0.24.1'],     # GDCM decodes the lossless JPEG that most angiographs write
+    'dicom': ['pydicom>=3.0.1', 'python-gdcm>=3.0.24.1'],   # GDCM decodes the lossless JPEG that most angiographs write
     'vtk': ['vtk>=9.3'],
     'gvxr': ['gvxr>=2.1' + WHEELS],
     'plot': ['matplotlib>=3.6'],
@@ -33,7 +34,8 @@ EXTRAS = {
 }
 EXTRAS['demo'] = EXTRAS['ros'] + EXTRAS['plot']
 EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
-EXTRAS['ros-kilted'] = [name.replace('jazzy', 'kilted') for name in EXTRAS['ros']]     # in place of Jazzy: one venv holds one of them
+# in place of Jazzy: one venv holds one of them
+EXTRAS['ros-kilted'] = [name.replace('jazzy', 'kilted') for name in EXTRAS['ros']]
 # atheris has wheels for these only, and its sources need clang
 EXTRAS['fuzz'] = ['atheris>=3.0' + WHEELS + ' and python_version < "3.14"', *EXTRAS['bags'], *EXTRAS['dicom']]
 EXTRAS['docs'] = ['sphinx>=8.0', 'myst-parser>=4.0', 'furo>=2024.8.6', *EXTRAS['bags']]
@@ -52,7 +54,7 @@ setup(
     maintainer='fluoro_shape_ros maintainers',
     maintainer_email='maintainers@fluoro-shape.example',
     license='Apache-2.0',
-    classifiers=[f'Programming Language :: Python :: 3.{minor}' for minor in (11, 12, 13)],     # with which .ci/run tests
+    classifiers=[f'Programming Language :: Python :: 3.{minor}' for minor in (11, 12, 13)],   # with which .ci/run tests
     keywords=['ROS', 'fluoroscopy', 'continuum robot', 'shape sensing'],
     packages=find_packages(include=[f'{NAME}*', 'msg_adapters*']),
     data_files=[
@@ -63,7 +65,8 @@ setup(
     ],
     entry_points={'console_scripts': [f'{name} = {module}:main' for name, module in EXECUTABLES.items()]},
     python_requires='>=3.11',
-    install_requires=['numpy>=1.26.4', 'scipy>=1.11.4', 'opencv-python-headless>=4.6', 'scikit-image>=0.22', 'tqdm>=4.60', 'pyyaml>=6.0'],
+    install_requires=['numpy>=1.26.4', 'scipy>=1.11.4', 'opencv-python-headless>=4.6', 'scikit-image>=0.22',
+                      'tqdm>=4.60', 'pyyaml>=6.0'],
     extras_require=EXTRAS,
     zip_safe=True,
 )

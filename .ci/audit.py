@@ -1,7 +1,9 @@
-"""Known vulnerabilities of what is installed beside this Python, by pip-audit; "not audited" where PyPI's service for that can't be reached.
+"""Known vulnerabilities of what is installed beside this Python, by pip-audit; "not audited" where PyPI's service for
+that can't be reached.
 
-`python .ci/audit.py` exits with 1 where a release without the vulnerability exists, which our bounds must then not keep out, and where the
-service answers but the audit does not work: that a vulnerable release, which is not installed, is found proves that it does.
+`python .ci/audit.py` exits with 1 where a release without the vulnerability exists, which our bounds must then not keep
+out, and where the service answers but the audit does not work: that a vulnerable release, which is not installed, is
+found proves that it does.
 """
 
 import json
@@ -11,7 +13,8 @@ import tempfile
 from pathlib import Path
 
 CANARY = 'django', '2.0'
-PROBE = 'import requests, sys; answer = requests.get(sys.argv[1], timeout=60); answer.raise_for_status(); assert answer.json()["vulnerabilities"]'
+PROBE = ('import requests, sys; answer = requests.get(sys.argv[1], timeout=60); answer.raise_for_status(); '
+         'assert answer.json()["vulnerabilities"]')
 
 
 def main() -> int:
@@ -22,11 +25,13 @@ def main() -> int:
         listed.write_text('\n'.join([*installed, '=='.join(CANARY)]))
         run(sys.executable, '-m', 'venv', own)
         run(own / 'bin' / 'pip', 'install', '-q', 'pip-audit')
-        probe = run(own / 'bin' / 'python', '-c', PROBE, 'https://pypi.org/pypi/{}/{}/json'.format(*CANARY), check=False)     # as pip-audit asks
+        probe = run(own / 'bin' / 'python', '-c', PROBE, 'https://pypi.org/pypi/{}/{}/json'.format(*CANARY),
+                    check=False)     # as pip-audit asks
         if probe.returncode:
             print(f'not audited: {probe.stderr.strip().splitlines()[-1]}')
             return 0
-        audit = run(own / 'bin' / 'pip-audit', '-r', listed, '--no-deps', '--disable-pip', '--progress-spinner', 'off', '--format', 'json', '--output', found, check=False)
+        audit = run(own / 'bin' / 'pip-audit', '-r', listed, '--no-deps', '--disable-pip', '--progress-spinner', 'off',
+                    '--format', 'json', '--output', found, check=False)
         if not found.exists():
             raise SystemExit(f'pip-audit failed: {audit.stderr.strip()}')
         return judge(json.loads(found.read_text())['dependencies'])

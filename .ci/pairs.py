@@ -1,6 +1,8 @@
-"""For mypy: `tuple(f(plane) for plane in planes)` is a pair where a pair is wanted, if what is in it fits; mypy can't know how long it is.
+"""For mypy: `tuple(f(plane) for plane in planes)` is a pair where a pair is wanted, if what is in it fits; mypy can't
+know how long it is.
 
-Where nothing says what is wanted, as in `seen = tuple(...)`, it may become a pair later, and what is in it is not looked at.
+Where nothing says what is wanted, as in `seen = tuple(...)`, it may become a pair later, and what is in it is not
+looked at.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,5 @@
-"""Sphinx makes pages of this folder: `sphinx-build -W docs build/docs`, with what the extra `docs` installs. ROS is not needed."""
+"""Sphinx makes pages of this folder: `sphinx-build -W docs build/docs`, with what the extra `docs` installs. ROS is not
+needed."""
 
 import inspect
 import re
@@ -27,10 +28,12 @@ autodoc_typehints_format = 'short'
 
 
 def held(cls: type) -> list[str]:
-    """What a class holds, for its docstring: the values of an enumeration, or a dataclass' fields, whose shapes and units stand in a comment beside them."""
+    """What a class holds, for its docstring: the values of an enumeration, or a dataclass' fields, whose shapes and
+    units stand in a comment beside them."""
     if issubclass(cls, Enum):
         return ['', ', '.join(f'`{member.value}`' for member in cls)]
-    fields = re.findall(r'^    (\w+): [^#\n]*# *(.+)$', inspect.getsource(cls), re.MULTILINE) if is_dataclass(cls) else []
+    fields = (re.findall(r'^    (\w+): [^#\n]*# *(.+)$', inspect.getsource(cls), re.MULTILINE)
+              if is_dataclass(cls) else [])
     return ['', *(f':param {name}: {words}' for name, words in fields)]
 
 

@@ -1,4 +1,5 @@
-"""Draws docs/devices.jpg: every device preset in both planes, before drawn anatomy. `python docs/draw_devices.py`, where the package is installed."""
+"""Draws docs/devices.jpg: every device preset in both planes, before drawn anatomy. `python docs/draw_devices.py`,
+where the package is installed."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ TITLE_PX = 24
 
 def planes_of(name: str, seed: int = SEED) -> np.ndarray:
     """(TITLE_PX + 2 SHOWN, SHOWN) uint8: the preset `name` as plane A and plane B show it."""
-    scene = xray_run(seed, views=biplane(arm=ARM), lengths=(0.055, 0.06), entering=True, device=load_device(name)).scene()
+    scene = xray_run(seed, views=biplane(arm=ARM), lengths=(0.055, 0.06), entering=True,
+                     device=load_device(name)).scene()
     title = np.full((TITLE_PX, SHOWN), 255, np.uint8)
     cv2.putText(title, name, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0, 1, cv2.LINE_AA)
     shown = [cv2.resize(stretched(image), (SHOWN, SHOWN), interpolation=cv2.INTER_AREA) for image in scene.frame.images]

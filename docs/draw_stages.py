@@ -1,4 +1,5 @@
-"""Draws docs/stages.png: one simulated pair on its way through the pipeline's own stages. `python docs/draw_stages.py`, where the package is installed with `plot`."""
+"""Draws docs/stages.png: one simulated pair on its way through the pipeline's own stages. `python docs/draw_stages.py`,
+where the package is installed with `plot`."""
 
 from __future__ import annotations
 
@@ -55,7 +56,8 @@ class Stages:
 
 
 def a_pair(seed: int, size: int) -> Scene:
-    """A rod that comes in through the border, before anatomy, beside a wire and between blades; the field is as large whatever the `size` in px."""
+    """A rod that comes in through the border, before anatomy, beside a wire and between blades; the field is as large
+    whatever the `size` in px."""
     arm = CArm(pixel_size_iso=0.3e-3 * SIZE / size, width=size, height=size)
     return xray_run(seed, views=biplane(arm=arm), clutter=('wire', 'blades'), entering=True).scene()
 
@@ -69,7 +71,8 @@ def stages(scene: Scene) -> Stages:
     hypotheses = list(islice(by_lines(scene.frame.views, lines), PROPOSED))
     fits = [f for f in (fit(sheet, h.curve, scene.radius, h.coarse) for h in hypotheses) if f is not None]
     seen = [(f, features(f, sheet, scene.radius, _tip_is_last(f, scene))) for f in fits]
-    return Stages(scene, fields, sheet, lines, hypotheses, sorted(seen, key=lambda s: -judge.load().log_odds(s[1])), reconstruct(scene.frame, config))
+    return Stages(scene, fields, sheet, lines, hypotheses, sorted(seen, key=lambda s: -judge.load().log_odds(s[1])),
+                  reconstruct(scene.frame, config))
 
 
 def _tip_is_last(f: Fit, scene: Scene) -> bool:
@@ -88,9 +91,10 @@ def draw(done: Stages, file: Path) -> None:
             _pair(pair, done, v)
             _lines(lines, done, v)
             _curves(curves, done, v)
-            _strips(figure.add_axes((0.785, bottom, 0.09, tall)), figure.add_axes((0.885, bottom, 0.105, tall)), done, v)
-        for x, title in ((0.005, '1  images, fields of view'), (0.252, '2  propose: lines in each image'), (0.499, '3  propose: curves in space'),
-                         (0.752, '4  fit: strips along a curve')):
+            _strips(figure.add_axes((0.785, bottom, 0.09, tall)),
+                    figure.add_axes((0.885, bottom, 0.105, tall)), done, v)
+        for x, title in ((0.005, '1  images, fields of view'), (0.252, '2  propose: lines in each image'),
+                         (0.499, '3  propose: curves in space'), (0.752, '4  fit: strips along a curve')):
             figure.text(x, 0.967, title, **TITLE)
         figure.text(0.005, 0.362, '5  judge: what speaks against a curve, in log odds', **TITLE)
         figure.text(0.57, 0.362, f'6  publish: backbone and tip, confidence {done.answer.confidence:.3f}', **TITLE)
@@ -102,8 +106,10 @@ def draw(done: Stages, file: Path) -> None:
 
 
 def _few_colours(picture: np.ndarray) -> Image.Image:
-    """The (H, W, 3) RGB picture in COLOURS colours; those of thin lines would get lost among greys, if they did not stand beside it in full."""
-    beside = np.concatenate([np.full((40, picture.shape[1], 3), [int(c[k:k + 2], 16) for k in (1, 3, 5)], np.uint8) for c in (TIP, EPIPOLAR, FOUND, MISSED)])
+    """The (H, W, 3) RGB picture in COLOURS colours; those of thin lines would get lost among greys, if they did not
+    stand beside it in full."""
+    beside = np.concatenate([np.full((40, picture.shape[1], 3), [int(c[k:k + 2], 16) for k in (1, 3, 5)], np.uint8)
+                             for c in (TIP, EPIPOLAR, FOUND, MISSED)])
     palette = Image.fromarray(np.concatenate([picture, beside])).quantize(COLOURS)
     return Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
 
@@ -113,7 +119,8 @@ def _image(ax, done: Stages, v: int, brightness: float = 1.0) -> None:
     image = done.scene.frame.images[v]
     h, w = image.shape
     black, white = grey_levels(image)
-    grey = np.clip((image.astype(np.float32) - black) / (white - black), 0, 1) * np.where(done.fields[v] > 0, brightness, DIM * brightness)
+    grey = np.clip((image.astype(np.float32) - black) / (white - black), 0, 1) * np.where(done.fields[v] > 0,
+                                                                                          brightness, DIM * brightness)
     small = np.round(cv2.resize(grey, (SIDE, SIDE), interpolation=cv2.INTER_AREA) * GREYS) / GREYS
     ax.imshow(small, cmap='gray', vmin=0, vmax=1, interpolation='nearest', extent=(-0.5, w - 0.5, h - 0.5, -0.5))
     ax.set(xticks=[], yticks=[])
@@ -123,7 +130,8 @@ def _image(ax, done: Stages, v: int, brightness: float = 1.0) -> None:
 def _pair(ax, done: Stages, v: int) -> None:
     _image(ax, done, v)
     ax.contour(done.fields[v] > 0, levels=[0.5], colors=[MISSED], linewidths=1.2)
-    ax.text(0.03, 0.97, f'plane {"AB"[v]}', transform=ax.transAxes, va='top', fontsize=13, bbox=dict(facecolor='black', edgecolor='none', alpha=0.6, pad=2))
+    ax.text(0.03, 0.97, f'plane {"AB"[v]}', transform=ax.transAxes, va='top', fontsize=13,
+            bbox=dict(facecolor='black', edgecolor='none', alpha=0.6, pad=2))
 
 
 def _lines(ax, done: Stages, v: int) -> None:
@@ -149,20 +157,25 @@ def _curves(ax, done: Stages, v: int) -> None:
 
 
 def _strips(ax, beside, done: Stages, v: int) -> None:
-    """The image straightened along the likeliest curve, each strip less its median, and how dark the device is in each."""
+    """The image straightened along the likeliest curve, each strip less its median, and how dark the device is in
+    each."""
     f = done.fits[0][0]
     profiles = cut(done.sheet, *f.spline.lines(f.s), REACH_PX).profiles[v]
-    profiles = cv2.resize(profiles - np.median(profiles, axis=1, keepdims=True), (126, SIDE), interpolation=cv2.INTER_AREA)
+    profiles = cv2.resize(profiles - np.median(profiles, axis=1, keepdims=True), (126, SIDE),
+                          interpolation=cv2.INTER_AREA)
     low, high = np.percentile(profiles, (0.5, 99.5))
     s = (f.s - f.start) * 1e3
-    ax.imshow(np.round(np.clip((profiles - low) / (high - low), 0, 1) * GREYS), cmap='gray', aspect='auto', extent=(-REACH_PX, REACH_PX, s[-1], s[0]), interpolation='nearest')
+    ax.imshow(np.round(np.clip((profiles - low) / (high - low), 0, 1) * GREYS), cmap='gray', aspect='auto',
+              extent=(-REACH_PX, REACH_PX, s[-1], s[0]), interpolation='nearest')
     beside.plot(np.clip(f.presence[:, v], -0.5, 2), s, color=FOUND, lw=0.8)
     for at in (0.0, (f.stop - f.start) * 1e3):
         for axes in (ax, beside):
             axes.axhline(at, color=TIP, lw=1.5)
-    ax.set(ylim=(s[-1], s[0]), xlabel='px across' if v else '', xticks=[-20, 0, 20], xticklabels=['-20', '0', '20'] if v else [])
+    ax.set(ylim=(s[-1], s[0]), xlabel='px across' if v else '', xticks=[-20, 0, 20],
+           xticklabels=['-20', '0', '20'] if v else [])
     ax.set_ylabel('mm along it', labelpad=0)
-    beside.set(xlim=(-0.5, 2), ylim=(s[-1], s[0]), yticks=[], xticks=[0, 1], xticklabels=['0', '1'] if v else [], xlabel='as dark as usual' if v else '')
+    beside.set(xlim=(-0.5, 2), ylim=(s[-1], s[0]), yticks=[], xticks=[0, 1], xticklabels=['0', '1'] if v else [],
+               xlabel='as dark as usual' if v else '')
     beside.grid(True, axis='x')
 
 
@@ -171,7 +184,8 @@ def _judged(ax, done: Stages) -> None:
     model = judge.load()
     for k, (colour, name, (_, x)) in enumerate(zip((FOUND, MISSED), ('the likeliest', 'the next one'), done.fits)):
         terms = model.terms(x)
-        ax.barh(np.arange(len(NAMES)) + 0.4 * k - 0.2, terms, 0.36, color=colour, label=f'{name}: {model.bias:+.1f} {terms.sum():+.1f} = {model.bias + terms.sum():+.1f}')
+        ax.barh(np.arange(len(NAMES)) + 0.4 * k - 0.2, terms, 0.36, color=colour,
+                label=f'{name}: {model.bias:+.1f} {terms.sum():+.1f} = {model.bias + terms.sum():+.1f}')
     ax.set(yticks=range(len(NAMES)), ylim=(len(NAMES) - 0.4, -0.6))
     ax.set_yticklabels([judge.REASONS[name] for name in NAMES], fontsize=9)
     ax.grid(True, axis='x')
@@ -191,7 +205,8 @@ def _backbone(ax, done: Stages) -> None:
     ax.plot(*truth.T, '--', color=TRUTH, lw=1.2, label='truth', zorder=10)
     ax.plot(*points[-1:].T, 'o', color=TIP, ms=8, label='tip', zorder=11)
     middle = (truth.max(axis=0) + truth.min(axis=0)) / 2
-    ax.set(**{f'{axis}lim': (m - half, m + half) for axis, m in zip('xyz', middle)}, xlabel='x (mm)', ylabel='y (mm)', zlabel='z (mm)')
+    ax.set(**{f'{axis}lim': (m - half, m + half) for axis, m in zip('xyz', middle)}, xlabel='x (mm)', ylabel='y (mm)',
+           zlabel='z (mm)')
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.set_pane_color('#1b2129')
     ax.tick_params(labelsize=8)
@@ -200,7 +215,8 @@ def _backbone(ax, done: Stages) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--out', type=Path, default=Path(__file__).with_name('stages.png'), help='default: beside this file')
+    parser.add_argument('--out', type=Path, default=Path(__file__).with_name('stages.png'),
+                        help='default: beside this file')
     parser.add_argument('--seed', type=int, default=SEED)
     parser.add_argument('--size', type=int, default=SIZE, help='of the images, px (default: %(default)s)')
     args = parser.parse_args(argv)

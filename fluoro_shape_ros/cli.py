@@ -14,7 +14,8 @@ class ToolError(Exception):
 
 
 def run(body, parser: argparse.ArgumentParser, argv=None) -> int:
-    """Parse `argv` and call `body(args)`. Returns the exit code: 0, 1 for a ToolError or OSError (one line on stderr), 130 for Ctrl-C.
+    """Parse `argv` and call `body(args)`. Returns the exit code: 0, 1 for a ToolError or OSError (one line on stderr),
+    130 for Ctrl-C.
 
     argparse itself exits with 2 for unusable arguments; `parser.error` does the same for what only `body` can find.
     """
@@ -38,7 +39,8 @@ def need(module: str, extra: str):
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ToolError(f'needs {module.split(".")[0]}, which is not installed here ({error}): pip install "fluoro_shape_ros[{extra}]"') from error
+        raise ToolError(f'needs {module.split(".")[0]}, which is not installed here ({error}): pip install '
+                        f'"fluoro_shape_ros[{extra}]"') from error
 
 
 # ---- types of arguments

@@ -1,4 +1,5 @@
-"""Every parameter once: default, unit, range and description. ROS parameters and docs/parameters.md are made from here."""
+"""Every parameter once: default, unit, range and description. ROS parameters and docs/parameters.md are made from
+here."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ class ConfigError(ValueError):
     """A parameter value that can't work; the message names the parameter and the reason."""
 
 
-def _p(default: Any, description: str, *, unit: str = '', low: float | None = None, high: float | None = None, choices: Sequence[str] = (),
-       element: type | None = None) -> Any:
+def _p(default: Any, description: str, *, unit: str = '', low: float | None = None, high: float | None = None,
+       choices: Sequence[str] = (), element: type | None = None) -> Any:
     """A dataclass field with what people need to know of it. `element` marks a list and gives its type."""
     meta = dict(description=description, unit=unit, low=low, high=high, choices=tuple(choices), element=element)
     return field(default=default, metadata=meta)
@@ -31,16 +32,20 @@ class InputConfig:
     """How images and cameras come in."""
 
     reference_frame: str = _p('', 'Frame of every result; empty: the frame_id of plane A\'s CameraInfo')
-    geometry: str = _p('camera_info', 'Where a plane\'s projection comes from: the full 3x4 P of CameraInfo, or P\'s intrinsics and a pose from tf',
+    geometry: str = _p('camera_info', 'Where a plane\'s projection comes from: the full 3x4 P of CameraInfo, '
+                                      'or P\'s intrinsics and a pose from tf',
                        choices=('camera_info', 'tf'))
     rectified: bool = _p(False, 'The images are already free of distortion: ignore D')
-    image_transport: str = _p('raw', 'Subscribe to image_raw, or to image_raw/compressed', choices=('raw', 'compressed'))
-    image_reliability: str = _p('auto', 'Reliability of the image and camera info subscriptions; auto: reliable, remade best-effort when that is all a publisher offers',
+    image_transport: str = _p('raw', 'Subscribe to image_raw, or to image_raw/compressed',
+                              choices=('raw', 'compressed'))
+    image_reliability: str = _p('auto', 'Reliability of the image and camera info subscriptions; '
+                                        'auto: reliable, remade best-effort when that is all a publisher offers',
                                 choices=('auto', 'reliable', 'best_effort'))
     sync_slop: float = _p(0.010, 'Largest difference of the stamps of a pair', unit='s', low=0.0, high=1.0)
     mask_frames: int = _p(8, 'Device-free pairs averaged into the mask image by ~/capture_mask', low=1, high=256)
     threads: int = _p(2, 'Threads that OpenCV may use; 0: as many as there are cores', low=0, high=64)
-    time_budget: float = _p(0.2, 'How long the node may work on a pair before that is refused as out_of_time; 0: no limit. Offline tools and method:=paper have none',
+    time_budget: float = _p(0.2, 'How long the node may work on a pair before that is refused as out_of_time; '
+                                 '0: no limit. Offline tools and method:=paper have none',
                             unit='s', low=0.0, high=60.0)
 
 
@@ -48,26 +53,35 @@ class InputConfig:
 class DetectionConfig:
     """How the device is found in one image."""
 
-    image_kind: str = _p('xray', 'What the images are: X-ray images, or silhouettes, segmentations made upstream (0 is background, all else device; polarity does not count)',
+    image_kind: str = _p('xray', 'What the images are: X-ray images, or silhouettes, segmentations made upstream '
+                                 '(0 is background, all else device; polarity does not count)',
                          choices=('xray', 'silhouette'))
     polarity: str = _p('dark', 'The device against its surroundings', choices=('dark', 'bright', 'auto'))
-    device: str = _p('', 'What the device is made of, from tip to base: a YAML file, or one of braided, cannula, cannula3, coil, ep, rod, tendon, tube; empty: unknown. '
+    device: str = _p('', 'What the device is made of, from tip to base: a YAML file, or one of braided, cannula, '
+                         'cannula3, coil, ep, rod, tendon, tube; empty: unknown. '
                          f'It gives the radius, the median over {VISIBLE:g} m from the tip, and tells tip from base')
-    robot_radius: float = _p(0.0006, 'Radius of the device; with the geometry it sets the filter scales. Where device is given, its own counts', unit='m', low=1e-5, high=0.02)
-    spacing_px: float = _p(10.0, 'Spacing of the control points along the device in the image (Burgner et al. 2011)', unit='px', low=1.0, high=200.0)
-    min_length_px: float = _p(60.0, 'Connected curves shorter than this in an image are not the device', unit='px', low=2.0, high=10000.0)
+    robot_radius: float = _p(0.0006, 'Radius of the device; with the geometry it sets the filter scales. '
+                                     'Where device is given, its own counts', unit='m', low=1e-5, high=0.02)
+    spacing_px: float = _p(10.0, 'Spacing of the control points along the device in the image (Burgner et al. 2011)',
+                           unit='px', low=1.0, high=200.0)
+    min_length_px: float = _p(60.0, 'Connected curves shorter than this in an image are not the device', unit='px',
+                              low=2.0, high=10000.0)
 
 
 @dataclass(frozen=True)
 class CurveConfig:
     """How the backbone is put together and which end is its tip."""
 
-    method: str = _p('spline', 'spline: a 3-D spline fitted to both images at once; paper: the published method of 2011, step by step', choices=('spline', 'paper'))
+    method: str = _p('spline', 'spline: a 3-D spline fitted to both images at once; '
+                               'paper: the published method of 2011, step by step', choices=('spline', 'paper'))
     backbone_spacing: float = _p(0.001, 'Arc-length step of the published backbone', unit='m', low=1e-5, high=0.1)
-    base_position: tuple[float, ...] = _p((), 'Where the device enters, x y z in the reference frame; empty: unknown', unit='m', element=float)
+    base_position: tuple[float, ...] = _p((), 'Where the device enters, x y z in the reference frame; empty: unknown',
+                                          unit='m', element=float)
     tracking: bool = _p(True, 'Start from the previous result')
-    prior_max_age: float = _p(0.5, 'A predicted_backbone older than the pair by more than this is not used', unit='s', low=0.0, high=60.0)
-    prior_sigma: float = _p(0.010, 'Standard deviation of a predicted_backbone at its tip: how far tissue may push the robot from where the model has it',
+    prior_max_age: float = _p(0.5, 'A predicted_backbone older than the pair by more than this is not used', unit='s',
+                              low=0.0, high=60.0)
+    prior_sigma: float = _p(0.010, 'Standard deviation of a predicted_backbone at its tip: '
+                                   'how far tissue may push the robot from where the model has it',
                             unit='m', low=1e-4, high=0.1)
 
 
@@ -75,11 +89,16 @@ class CurveConfig:
 class PlausibilityConfig:
     """When a reconstruction is believed."""
 
-    expected_length: tuple[float, ...] = _p((), 'Shortest and longest believable length of the visible device, [min, max]; empty: no check', unit='m', element=float)
-    max_curvature: float = _p(0.0, 'Largest believable curvature of the backbone; 0: the rule of Burgner et al. 2011, eq. 3', unit='1/m', low=0.0, high=1e6)
-    max_reprojection_px: float = _p(3.0, 'Largest believable median distance between the reprojected backbone and the centreline seen', unit='px', low=0.1, high=100.0)
-    max_tip_sigma: float = _p(0.0, 'Largest standard deviation of the tip in its worst direction; 0: no check', unit='m', low=0.0, high=1.0)
-    min_confidence: float = _p(0.9, 'Least probability of being right that a backbone is published with', low=0.0, high=1.0)
+    expected_length: tuple[float, ...] = _p((), 'Shortest and longest believable length of the visible device, '
+                                                '[min, max]; empty: no check', unit='m', element=float)
+    max_curvature: float = _p(0.0, 'Largest believable curvature of the backbone; '
+                                   '0: the rule of Burgner et al. 2011, eq. 3', unit='1/m', low=0.0, high=1e6)
+    max_reprojection_px: float = _p(3.0, 'Largest believable median distance between the reprojected backbone and the '
+                                         'centreline seen', unit='px', low=0.1, high=100.0)
+    max_tip_sigma: float = _p(0.0, 'Largest standard deviation of the tip in its worst direction; 0: no check',
+                              unit='m', low=0.0, high=1.0)
+    min_confidence: float = _p(0.9, 'Least probability of being right that a backbone is published with',
+                               low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,8 @@ class Distortion:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One calibrated X-ray view: source (pinhole), detector (image) and where they stand. Equal is only the same object."""
+    """One calibrated X-ray view: source (pinhole), detector (image) and where they stand. Equal is only the same
+    object."""
 
     name: str           # 'a' or 'b'
     P: np.ndarray       # (3, 4) projection, reference frame (m) to pixels; |P[2, :3]| = 1, so w is the depth in m
@@ -73,8 +74,10 @@ class Prior:
     before_stamp_ns: int | None = None
     masks: tuple[np.ndarray, np.ndarray] | None = None  # (H, W) float32, device-free mean image of each plane
     predicted: np.ndarray | None = None     # (N, 3) a kinematic model's guess, base to tip, m
-    prediction_fault: str = ''              # why the newest guess can't be used; empty where it can, or where there is none
-    search: Any = None                      # a method.search.Search of an earlier pair that was cut short, to go on with
+    prediction_fault: str = ''              # why the newest guess can't be used; empty where it can,
+                                            # or where there is none
+    search: Any = None                      # a method.search.Search of an earlier pair that was cut short,
+                                            # to go on with
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,8 @@ class Shape:
     points: np.ndarray          # (N, 3) m; equal arc-length steps, the last one exactly the tip
     s: np.ndarray               # (N,) m, arc length from the base
     covariance: np.ndarray      # (N, 3, 3) m^2; NaN where the method does not know it
-    residuals_px: np.ndarray    # (N, 2) distance of the reprojected point to the centreline seen in plane A, B; NaN: not seen there
+    residuals_px: np.ndarray    # (N, 2) distance of the reprojected point to the centreline seen in plane A, B;
+                                # NaN: not seen there
 
     @property
     def tip(self) -> np.ndarray:
@@ -116,12 +120,14 @@ class Shape:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Places of the device that each plane shows by itself, undistorted pixels: do they lie on one another's epipolar lines?"""
+    """Places of the device that each plane shows by itself, undistorted pixels: do they lie on one another's epipolar
+    lines?"""
 
     kinds: tuple[str, ...]      # N of: tip, base, steps (bands along it), bend (where it runs along its epipolar line)
     a_px: np.ndarray            # (N, 2)
     b_px: np.ndarray            # (N, 2)
-    slack_px: np.ndarray        # (N, 2) standard deviation of b_px along the device in plane B, towards its end; 0: a bend
+    slack_px: np.ndarray        # (N, 2) standard deviation of b_px along the device in plane B, towards its end;
+                                # 0: a bend
 
 
 @dataclass(frozen=True)
@@ -134,12 +140,16 @@ class Reconstruction:
     warnings: tuple[str, ...] = ()                      # e.g. tip_ambiguous
     centerlines: tuple[Centerline | None, Centerline | None] = (None, None)
     stage_seconds: dict[str, float] = field(default_factory=dict)   # wall time of each stage
-    prediction: str = ''                                # agrees, not compared, or ignored and why; empty: there was none
-    confidence: float = float('nan')                    # probability that the shape is right; of a rejected pair that of the best curve tried; NaN: none was, or not known
+    prediction: str = ''                                # agrees, not compared, or ignored and why;
+                                                        # empty: there was none
+    confidence: float = float('nan')                    # probability that the shape is right; of a rejected pair that
+                                                        # of the best curve tried; NaN: none was, or not known
 
     search: Any = None                                  # a method.search.Search that was cut short
-    landmarks: Landmarks | None = None                  # of the curve, of a rejected pair too; None: there is none, or the method finds none
+    landmarks: Landmarks | None = None                  # of the curve, of a rejected pair too; None: there is none, or
+                                                        # the method finds none
 
     def __post_init__(self) -> None:
         if (self.outcome is Outcome.OK) != (self.shape is not None):
-            raise ValueError(f'a {self.outcome.value} reconstruction must {"" if self.shape is None else "not "}have a shape')
+            raise ValueError(f'a {self.outcome.value} reconstruction must '
+                             f'{"" if self.shape is None else "not "}have a shape')

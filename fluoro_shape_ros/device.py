@@ -6,9 +6,10 @@
     bands:
       - {at: 0.002, length: 0.001, radius: 0.00075, material: platinum}
 
-All lengths are in m; `at` is where a band begins, counted from the tip; `every` repeats it up to the base. Bands and disks sit around the segment
-that they lie on and are as thick as they stand out. A lumen, like all that surrounds the device, is filled with tissue or blood. Instead of a
-`material` there may be `attenuation`: 1/m, beyond that of tissue, at REFERENCE_KEV.
+All lengths are in m; `at` is where a band begins, counted from the tip; `every` repeats it up to the base. Bands and
+disks sit around the segment that they lie on and are as thick as they stand out. A lumen, like all that surrounds the
+device, is filled with tissue or blood. Instead of a `material` there may be `attenuation`: 1/m, beyond that of tissue,
+at REFERENCE_KEV.
 """
 
 from __future__ import annotations
@@ -31,18 +32,23 @@ SHORTEST, LONGEST = 1e-5, 10.0      # m, of a part of a device
 THINNEST, WIDEST = 1e-5, 0.01       # m, of a radius
 CLOSEST = 1e-4                      # m, between bands and disks that repeat, all taken together
 SLIVER = 1e-9                       # m: thinner is a rounding error
-LARGEST_FILE, LARGEST_LIST, LARGEST_MAP, DEEPEST = 65536, 1000, 100, 20      # bytes, entries, keys, brackets within one another
+# bytes, entries, keys, brackets within one another
+LARGEST_FILE, LARGEST_LIST, LARGEST_MAP, DEEPEST = 65536, 1000, 100, 20
 
-# Mass attenuation coefficients in cm^2/g at ENERGIES_KEV (NIST XCOM), times density in g/cm^3, less that of the water that is displaced: 1/cm.
-# Metal is nitinol with 55.8 % of nickel in its weight, polymer that of catheters: PEBAX with 10 % of barium sulfate.
+# Mass attenuation coefficients in cm^2/g at ENERGIES_KEV (NIST XCOM), times density in g/cm^3, less that of the water
+# that is displaced: 1/cm. Metal is nitinol with 55.8 % of nickel in its weight, polymer that of catheters: PEBAX with
+# 10 % of barium sulfate.
 ENERGIES_KEV = np.array([40.0, 50.0, 60.0, 80.0, 100.0])
 WATER = np.array([0.2683, 0.2269, 0.2059, 0.1837, 0.1707])
-_NITINOL = 6.45 * (0.558 * np.array([4.600, 2.474, 1.512, 0.7306, 0.4440]) + 0.442 * np.array([2.214, 1.213, 0.7661, 0.4052, 0.2721]))
+_NITINOL = 6.45 * (0.558 * np.array([4.600, 2.474, 1.512, 0.7306, 0.4440])
+                   + 0.442 * np.array([2.214, 1.213, 0.7661, 0.4052, 0.2721]))
 _PLATINUM = 21.45 * np.array([12.45, 6.954, 4.339, 8.731, 4.993])
-_PEBAX, _BARIUM_SULFATE = np.array([0.2319, 0.2085, 0.1952, 0.1791, 0.1684]), np.array([14.66, 8.252, 5.116, 2.414, 1.362])
+_PEBAX, _BARIUM_SULFATE = (np.array([0.2319, 0.2085, 0.1952, 0.1791, 0.1684]),
+                           np.array([14.66, 8.252, 5.116, 2.414, 1.362]))
 _POLYMER = 1.10 * (0.9 * _PEBAX + 0.1 * _BARIUM_SULFATE)
 MATERIALS = {'metal': _NITINOL - WATER, 'platinum': _PLATINUM - WATER, 'polymer': _POLYMER - WATER}
-K_EDGES = {'platinum': ([78.39, 78.40], 21.45 * np.array([2.204, 9.373]) - 0.1850)}      # keV on either side, and 1/cm there
+# keV on either side, and 1/cm there
+K_EDGES = {'platinum': ([78.39, 78.40], 21.45 * np.array([2.204, 9.373]) - 0.1850)}
 
 
 class DeviceError(ValueError):
@@ -97,7 +103,8 @@ class Device:
             _check_material(s.material, where)
             if not (SHORTEST <= s.length <= LONGEST or s.length == REST and k == len(self.segments) - 1):
                 given = 'rest' if s.length == REST else f'{s.length:g}'
-                raise DeviceError(f'{where}: length must lie in [{SHORTEST:g}, {LONGEST:g}] m, or be `rest` in the last segment, got {given}')
+                raise DeviceError(f'{where}: length must lie in [{SHORTEST:g}, {LONGEST:g}] m, '
+                                  f'or be `rest` in the last segment, got {given}')
             if not THINNEST <= s.radius <= WIDEST:
                 raise DeviceError(f'{where}: radius must lie in [{THINNEST:g}, {WIDEST:g}] m, got {s.radius:g}')
             if not 0 <= s.lumen < s.radius:
@@ -123,7 +130,8 @@ class Device:
         end = REST if r.every else r.at + r.length
         under = max(s.radius for _, _, s in _between(self._spans(end), r.at, end))
         if r.radius <= under:
-            raise DeviceError(f'{where}: radius {r.radius:g} m does not stand out from the segment that it sits on, of {under:g} m')
+            raise DeviceError(f'{where}: radius {r.radius:g} m does not stand out from the segment that it sits on, '
+                              f'of {under:g} m')
 
     @property
     def radius(self) -> float:
@@ -141,17 +149,20 @@ class Device:
         return sum(s.length for s in self.segments)
 
     def pieces(self, length: float) -> list[Piece]:
-        """All parts of a device of which `length` m are there, from the tip; a `rest` ends there, and what the file has beyond does not count."""
+        """All parts of a device of which `length` m are there, from the tip; a `rest` ends there, and what the file has
+        beyond does not count."""
         spans = self._spans(length)
         found = [Piece(start, stop, s.radius, s.lumen, s.material) for start, stop, s in spans]
         for ring in (*self.bands, *self.disks):
             for at in np.arange(ring.at, length, ring.every).tolist() if ring.every else [ring.at]:
                 # a ring that lies across a joint is as thick on either side as it stands out there
-                found += [Piece(start, stop, ring.radius, s.radius, ring.material) for start, stop, s in _between(spans, at, at + ring.length)]
+                found += [Piece(start, stop, ring.radius, s.radius, ring.material)
+                          for start, stop, s in _between(spans, at, at + ring.length)]
         return found
 
     def _spans(self, length: float) -> list[tuple[float, float, Segment]]:
-        """Start, stop (m from the tip, at most `length`) and segment, of those that are there; the last one goes on to `length`."""
+        """Start, stop (m from the tip, at most `length`) and segment, of those that are there; the last one goes on to
+        `length`."""
         spans, start = [], 0.0
         for k, s in enumerate(self.segments):
             stop = length if k == len(self.segments) - 1 else min(start + s.length, length)
@@ -163,13 +174,16 @@ class Device:
 
 def _between(spans: list[tuple[float, float, Segment]], low: float, high: float) -> list[tuple[float, float, Segment]]:
     """What of `spans` lies from `low` to `high`, m from the tip."""
-    return [(max(low, start), min(high, stop), s) for start, stop, s in spans if min(high, stop) - max(low, start) > SLIVER]
+    return [(max(low, start), min(high, stop), s) for start, stop, s in spans
+            if min(high, stop) - max(low, start) > SLIVER]
 
 
 def attenuation(material: str | float, energy_kev: float) -> float:
-    """1/m, beyond that of the tissue that is displaced, at an effective energy within ENERGIES_KEV; log-log between the tabulated ones.
+    """1/m, beyond that of the tissue that is displaced, at an effective energy within ENERGIES_KEV; log-log between the
+    tabulated ones.
 
-    A number is that at REFERENCE_KEV, and falls with energy as that of metal does. Raises DeviceError for an energy beyond them.
+    A number is that at REFERENCE_KEV, and falls with energy as that of metal does. Raises DeviceError for an energy
+    beyond them.
     """
     if not isinstance(material, str):
         return float(material) * attenuation('metal', energy_kev) / attenuation('metal', REFERENCE_KEV)
@@ -181,16 +195,19 @@ def water_attenuation(energy_kev: float) -> float:
     return _at_energy(WATER, energy_kev)
 
 
-def _at_energy(tabulated: np.ndarray, energy_kev: float, edge_kev: Sequence[float] = (), at_edge: Sequence[float] = ()) -> float:
+def _at_energy(tabulated: np.ndarray, energy_kev: float, edge_kev: Sequence[float] = (),
+               at_edge: Sequence[float] = ()) -> float:
     if not ENERGIES_KEV[0] <= energy_kev <= ENERGIES_KEV[-1]:
-        raise DeviceError(f'attenuation is known from {ENERGIES_KEV[0]:g} to {ENERGIES_KEV[-1]:g} keV, not at {energy_kev:g} keV')
+        raise DeviceError(f'attenuation is known from {ENERGIES_KEV[0]:g} to {ENERGIES_KEV[-1]:g} keV, '
+                          f'not at {energy_kev:g} keV')
     k = np.searchsorted(ENERGIES_KEV, edge_kev)
     energies, values = np.insert(ENERGIES_KEV, k, edge_kev), np.insert(tabulated, k, at_edge)
     return float(100 * np.exp(np.interp(np.log(energy_kev), np.log(energies), np.log(values))))
 
 
 def load_device(name: str | Path) -> Device:
-    """The device of a YAML file: a path, or the name of a preset in the package's share (`cannula` or `device_cannula.yaml`).
+    """The device of a YAML file: a path, or the name of a preset in the package's share (`cannula` or
+    `device_cannula.yaml`).
 
     Raises DeviceError that names the file, and what in it is wrong.
     """
@@ -208,7 +225,8 @@ def load_device(name: str | Path) -> Device:
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses what can't be meant: a key that is there twice, of which one would be lost, and what takes YAML for ever."""
+    """Refuses what can't be meant: a key that is there twice, of which one would be lost, and what takes YAML for
+    ever."""
 
     def fetch_flow_collection_start(self, kind: Any) -> None:
         if self.flow_level >= DEEPEST:      # the scanner looks at all of them again for each token
@@ -219,12 +237,14 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_mapping_node(anchor)
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         if len(set(keys)) < len(keys):
-            raise yaml.composer.ComposerError(None, None, f'{_brief(Counter(keys).most_common(1)[0][0])} is there twice', node.start_mark)
+            raise yaml.composer.ComposerError(None, None, f'{_brief(Counter(keys).most_common(1)[0][0])} is '
+                                                          'there twice', node.start_mark)
         return node
 
     def flatten_mapping(self, node: Any) -> None:
         super().flatten_mapping(node)
-        if len(node.value) > LARGEST_MAP:       # in older PyYAML maps that merge others, and these others, grow exponentially
+        # in older PyYAML maps that merge others, and these others, grow exponentially
+        if len(node.value) > LARGEST_MAP:
             raise yaml.constructor.ConstructorError(None, None, f'more than {LARGEST_MAP} keys', node.start_mark)
 
 
@@ -249,7 +269,8 @@ def device_from(content: object) -> Device:
     if not isinstance(content, dict) or not content.get('segments'):
         raise DeviceError('no device: a list `segments` is needed')
     segments = [_part(Segment, p, f'segments[{k}]') for k, p in enumerate(_listed(content, 'segments'))]
-    bands, disks = ([_part(Ring, p, f'{name}[{k}]') for k, p in enumerate(_listed(content, name))] for name in ('bands', 'disks'))
+    bands, disks = ([_part(Ring, p, f'{name}[{k}]') for k, p in enumerate(_listed(content, name))]
+                    for name in ('bands', 'disks'))
     return Device(tuple(segments), tuple(bands), tuple(disks))
 
 
@@ -269,14 +290,17 @@ def _part(kind: Any, part: object, where: str) -> Any:
     given = dict(part)
     if ('material' in given) == ('attenuation' in given):
         raise DeviceError(f'{where}: needs either material or attenuation')
-    material = given.pop('material') if 'material' in given else _number(given.pop('attenuation'), f'{where}: attenuation')
+    material = given.pop('material') if 'material' in given else _number(given.pop('attenuation'),
+                                                                         f'{where}: attenuation')
     if 'material' in part and not isinstance(material, str):
         raise DeviceError(f'{where}: material must be a name, got {_brief(material)}; a number is called attenuation')
-    _refuse_unknown(given, [*(name for name in kind.__dataclass_fields__ if name != 'material'), 'material', 'attenuation'], f'{where}: ')
+    _refuse_unknown(given, [*(name for name in kind.__dataclass_fields__ if name != 'material'), 'material',
+                            'attenuation'], f'{where}: ')
     required = {'length', 'radius'} if kind is Segment else {'at', 'length', 'radius'}
     if missing := required - given.keys():
         raise DeviceError(f'{where}: {", ".join(sorted(missing))} is missing')
-    values = {name: REST if (kind, name, value) == (Segment, 'length', 'rest') else _number(value, f'{where}: {name}') for name, value in given.items()}
+    values = {name: REST if (kind, name, value) == (Segment, 'length', 'rest') else _number(value, f'{where}: {name}')
+              for name, value in given.items()}
     return kind(material=material, **values)
 
 
@@ -309,7 +333,8 @@ def _brief(value: object, most: int = 40) -> str:
 def _check_material(material: Any, where: str) -> None:
     if isinstance(material, str):
         if material not in MATERIALS:
-            raise DeviceError(f'{where}: no material is called {_brief(material)}: there are {", ".join(MATERIALS)}, or attenuation in 1/m')
+            raise DeviceError(f'{where}: no material is called {_brief(material)}: there are {", ".join(MATERIALS)}, '
+                              'or attenuation in 1/m')
     elif isinstance(material, bool) or not 0 < material < 1e6:
         raise DeviceError(f'{where}: attenuation must lie in (0, 1e6) 1/m, got {material:g}')
 
@@ -327,7 +352,8 @@ def _find(name: str) -> Path:
                 continue
     except (OSError, RuntimeError):     # a name too long, a folder that may not be looked into, the home of nobody
         pass
-    raise DeviceError(f'{_brief(name, 200)}: no such file, nor a device in the package\'s share; there are {", ".join(presets())}')
+    raise DeviceError(f'{_brief(name, 200)}: no such file, nor a device in the package\'s share; '
+                      f'there are {", ".join(presets())}')
 
 
 def presets() -> list[str]:

@@ -1,4 +1,5 @@
-"""Work on many tasks, in processes of this machine or on the workers of a Dask scheduler: the same results, in the same order."""
+"""Work on many tasks, in processes of this machine or on the workers of a Dask scheduler: the same results, in the same
+order."""
 
 from __future__ import annotations
 
@@ -30,10 +31,12 @@ RETRIES = 2             # of a task that failed where it ran, a file may be miss
 
 
 def in_order(function: Callable[[Any], Any], tasks: Sequence, jobs: int = 1, scheduler: str | None = None) -> Iterator:
-    """`function(task)` of all tasks in their order, by `jobs` processes of one thread each or by the workers of a Dask `scheduler` at this address.
+    """`function(task)` of all tasks in their order, by `jobs` processes of one thread each or by the workers of a Dask
+    `scheduler` at this address.
 
-    `function` is one of a module's, and pure: the results do not depend on who makes them. Raises ToolError where a process dies, where no scheduler
-    answers, its workers lack this package or all stay away; and whatever a task raises.
+    `function` is one of a module's, and pure: the results do not depend on who makes them. Raises ToolError where a
+    process dies, where no scheduler answers, its workers lack this package or all stay away; and whatever a task
+    raises.
     """
     return _on_cluster(function, tasks, scheduler) if scheduler else _in_processes(function, tasks, jobs)
 
@@ -75,8 +78,8 @@ def _start_child() -> None:
 class _Call:
     """Whoever unpickles it gets function(task).
 
-    So a task can travel as bytes, and loading this package is a part of the task: a worker that lacks it says so, where one that could not read
-    what it is sent would end, and its scheduler need not have it.
+    So a task can travel as bytes, and loading this package is a part of the task: a worker that lacks it says so, where
+    one that could not read what it is sent would end, and its scheduler need not have it.
     """
 
     function: Callable
@@ -105,7 +108,8 @@ def _on_cluster(function: Callable, tasks: Sequence, address: str) -> Iterator:
     except (OSError, ValueError) as error:      # OSError: TimeoutError too
         raise ToolError(f'no Dask scheduler answers at {address} ({error})') from error
     with client:
-        calls = (client.submit(pickle.loads, pickle.dumps(_Call(function, task)), pure=False, retries=RETRIES) for task in tasks)
+        calls = (client.submit(pickle.loads, pickle.dumps(_Call(function, task)), pure=False, retries=RETRIES)
+                 for task in tasks)
         ahead = deque(islice(calls, AHEAD))
         while ahead:
             yield _result(client, ahead.popleft(), address)
@@ -134,7 +138,8 @@ def _blame_worker(error: Exception, address: str) -> None:
     """Raises ToolError where a task failed because of those who ran it."""
     from distributed import KilledWorker
     if isinstance(error, ImportError):
-        raise ToolError(f'a worker of {address} can\'t load what it needs ({error}): install the same fluoro_shape_ros there') from error
+        raise ToolError(f'a worker of {address} can\'t load what it needs ({error}): install the same '
+                        'fluoro_shape_ros there') from error
     if isinstance(error, KilledWorker):
         raise ToolError(f'a task at {address} ended {error.allowed_failures + 1} workers, one after another') from error
 

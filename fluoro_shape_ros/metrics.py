@@ -15,7 +15,8 @@ DENSE = 0.05e-3     # m: both curves are sampled this finely
 class Errors:
     """All in metres."""
 
-    mean: float         # mean distance of the reconstructed curve to the closest point of the true one (the paper's measure)
+    mean: float         # mean distance of the reconstructed curve to the closest point of the true one
+                        # (the paper's measure)
     missed: float       # the same the other way round: truth that was not reconstructed shows here
     worst: float        # largest of both directions (Hausdorff)
     tip: float          # distance of the tips
@@ -28,19 +29,21 @@ def compare(points: np.ndarray, truth: np.ndarray) -> Errors:
     found, true = _dense(points), _dense(truth)
     to_true, to_found = distance_to(found, true), distance_to(true, found)
     n = min(len(found), len(true))
-    return Errors(float(to_true.mean()), float(to_found.mean()), float(max(to_true.max(), to_found.max())), float(np.linalg.norm(found[-1] - true[-1])),
-                  abs(float(arc_length(found)[-1] - arc_length(true)[-1])), float(np.linalg.norm(found[-n:] - true[-n:], axis=1).mean()))
+    return Errors(float(to_true.mean()), float(to_found.mean()), float(max(to_true.max(), to_found.max())),
+                  float(np.linalg.norm(found[-1] - true[-1])), abs(float(arc_length(found)[-1] - arc_length(true)[-1])),
+                  float(np.linalg.norm(found[-n:] - true[-n:], axis=1).mean()))
 
 
 def _dense(points: np.ndarray) -> np.ndarray:
-    """A smooth curve through the points in steps of DENSE counted from the tip, so that equal indices from the end are equal arc lengths from
-    the tip; only the first step, at the base, may be shorter."""
+    """A smooth curve through the points in steps of DENSE counted from the tip, so that equal indices from the end are
+    equal arc lengths from the tip; only the first step, at the base, may be shorter."""
     return resample(points[::-1], DENSE)[0][::-1]
 
 
 def surprise(error: np.ndarray, covariance: np.ndarray) -> float:
-    """Squared Mahalanobis distance of a (3,) error under its reported (3, 3) covariance: chi-squared with three degrees of freedom where the
-    report is honest. NaN where the covariance is not known, inf where it leaves no room for the error."""
+    """Squared Mahalanobis distance of a (3,) error under its reported (3, 3) covariance: chi-squared with three degrees
+    of freedom where the report is honest. NaN where the covariance is not known, inf where it leaves no room for the
+    error."""
     if not np.isfinite(covariance).all():
         return float('nan')
     variances, axes = np.linalg.eigh(covariance)

@@ -40,8 +40,10 @@ class Stroke:
     dashed: bool = False    # so that what lies under it shows
 
 
-def overlay(image: np.ndarray, plane: int, result: Reconstruction, views: tuple[View, View] | None = None) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: the (H, W) image of plane 0 (A) or 1 (B) with what was seen in it and what became of the pair, in words.
+def overlay(image: np.ndarray, plane: int, result: Reconstruction,
+            views: tuple[View, View] | None = None) -> np.ndarray:
+    """(H, W, 3) uint8 BGR: the (H, W) image of plane 0 (A) or 1 (B) with what was seen in it and what became of the
+    pair, in words.
 
     Without `views`, of a pair that has none, only image and words.
     """
@@ -60,7 +62,8 @@ def overlay(image: np.ndarray, plane: int, result: Reconstruction, views: tuple[
     top = write(canvas, [(f'plane {"AB"[plane]}: {title}', colour), *((line, WORDS) for line in rest)])
     bottom = caption(canvas, {s.name: s.colour for s in strokes if s.name != 'tip ring'})
     if inset is not None:
-        _place(canvas[top:bottom], inset, np.vstack([s.points_px for s in strokes if s.name in ('seen', 'backbone')]) - (0, top))
+        _place(canvas[top:bottom], inset,
+               np.vstack([s.points_px for s in strokes if s.name in ('seen', 'backbone')]) - (0, top))
     return canvas
 
 
@@ -80,7 +83,8 @@ def words(result: Reconstruction) -> list[str]:
 def tip_sigma(shape: Shape) -> float:
     """Standard deviation of the tip in its worst direction, m; NaN where the method does not know it."""
     covariance = shape.covariance[-1]
-    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0))) if np.isfinite(covariance).all() else float('nan')
+    return (float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+            if np.isfinite(covariance).all() else float('nan'))
 
 
 # ---- what there is to see
@@ -98,12 +102,14 @@ def evidence(plane: int, result: Reconstruction, views: tuple[View, View]) -> li
     if shape is not None:
         tip = distort(view, project(view.P, shape.points[-1:]))
         ellipse = tip_ellipse(view, shape)
-        strokes.append(Stroke('tip' if ellipse is None else f'tip, {CONFIDENCE:.0%}', tip if ellipse is None else ellipse, TIP))
+        strokes.append(Stroke('tip' if ellipse is None else f'tip, {CONFIDENCE:.0%}',
+                              tip if ellipse is None else ellipse, TIP))
     return strokes
 
 
 def tip_ellipse(view: View, shape: Shape) -> np.ndarray | None:
-    """(65, 2) px, the closed contour within which the tip lies with CONFIDENCE; None where the method does not know it."""
+    """(65, 2) px, the closed contour within which the tip lies with CONFIDENCE; None where the method does not know
+    it."""
     if not np.isfinite(shape.covariance[-1]).all() or depth(view.P, shape.tip) <= 0:
         return None
     J = projection_jacobian(view.P, shape.tip[None])[0]
@@ -113,9 +119,11 @@ def tip_ellipse(view: View, shape: Shape) -> np.ndarray | None:
 
 
 def tip_lines(view: View, other: View, seen, shape: Shape | None) -> list[np.ndarray]:
-    """The curves (N, 2) in `view` on which the tip must lie by what `other` saw of it: where they miss it, the calibration is off.
+    """The curves (N, 2) in `view` on which the tip must lie by what `other` saw of it: where they miss it, the
+    calibration is off.
 
-    `seen` is the Centerline of the other plane or None. Without a shape nobody knows which end is the tip: a curve for each.
+    `seen` is the Centerline of the other plane or None. Without a shape nobody knows which end is the tip: a curve for
+    each.
     """
     ends = np.empty((0, 2)) if seen is None else seen.points_px[[0, -1]]
     if shape is not None:
@@ -133,18 +141,20 @@ def across(line: np.ndarray, width: int, height: int) -> np.ndarray:
     center = np.array([width - 1, height - 1]) / 2
     foot = center - (line[:2] @ center + line[2]) * line[:2]
     points = foot + np.linspace(-1, 1, 65)[:, None] * np.hypot(width, height) * np.array([-line[1], line[0]])
-    return points[(np.abs(points - center) < 0.55 * np.array([width, height])).all(axis=1)]     # farther out a distortion model says nothing
+    # farther out a distortion model says nothing
+    return points[(np.abs(points - center) < 0.55 * np.array([width, height])).all(axis=1)]
 
 
 # ---- how it is drawn
 
 
 def grey_levels(image: np.ndarray) -> tuple[float, float]:
-    """The levels of an (H, W) image of any range that are to be black and white: neither noise nor the unexposed border sets them."""
+    """The levels of an (H, W) image of any range that are to be black and white: neither noise nor the unexposed border
+    sets them."""
     h, w = image.shape
     small = cv2.resize(image, (-(-w // 4), -(-h // 4)), interpolation=cv2.INTER_AREA)
     exposed = small > 0.12 * np.percentile(small[::4, ::4], 95)
-    exposed = small[cv2.erode(exposed.astype(np.uint8), np.ones((5, 5))) > 0][::2]      # without the field's blurred rim
+    exposed = small[cv2.erode(exposed.astype(np.uint8), np.ones((5, 5))) > 0][::2]  # without the field's blurred rim
     low, high = np.percentile(exposed if exposed.size else small, (0.1, 99.9))
     noise = np.median(np.abs(np.diff(image[::32].astype(np.float32)))) if w > 1 else 0.0
     middle, half = (low + high) / 2, max(high - low, NOISE_SPAN * noise, 0.01 * abs(high), 1e-6) / 2
@@ -166,11 +176,13 @@ def draw(canvas: np.ndarray, strokes: list[Stroke], unit: int) -> None:
     for stroke in strokes:
         points = stroke.points_px[np.isfinite(stroke.points_px).all(axis=1)].clip(-1e5, 1e5)
         pieces = dashes(points, DASH * unit) if stroke.dashed else points[None]
-        cv2.polylines(canvas, list(np.round(pieces * 2**SHIFT).astype(np.int32)), False, bgr(stroke.colour), unit, cv2.LINE_AA, SHIFT)
+        cv2.polylines(canvas, list(np.round(pieces * 2**SHIFT).astype(np.int32)), False, bgr(stroke.colour), unit,
+                      cv2.LINE_AA, SHIFT)
 
 
 def dashes(points: np.ndarray, length_px: int) -> np.ndarray:
-    """(M, length_px + 1, 2) pieces of an (N, 2) curve, `length_px` long and as far from each other, the first at its begin."""
+    """(M, length_px + 1, 2) pieces of an (N, 2) curve, `length_px` long and as far from each other, the first at its
+    begin."""
     if len(points) < 2:
         return np.empty((0, length_px + 1, 2))
     s = np.arange(0.0, arc_length(points)[-1], 2.0 * length_px)[:, None] + np.arange(length_px + 1)
@@ -200,15 +212,18 @@ def _place(canvas: np.ndarray, inset: np.ndarray, avoid: np.ndarray) -> None:
 
 
 def free_corner(points: np.ndarray, side: float, corners=((0, 1), (1, 1), (0, 0), (1, 0))) -> tuple[int, int]:
-    """The one of `corners` (right, below: 0 or 1) whose square of `side` holds fewest of (N, 2) points in the unit square, v down."""
+    """The one of `corners` (right, below: 0 or 1) whose square of `side` holds fewest of (N, 2) points in the unit
+    square, v down."""
     return min(corners, key=lambda c: np.count_nonzero((np.abs(points - np.array(c)) < side + 0.03).all(axis=1)))
 
 
 def write(canvas: np.ndarray, lines: list[tuple[str, str]]) -> int:
-    """Write (text, colour) lines on a darkened strip at the top, broken where they are too long; the strip's height in px."""
+    """Write (text, colour) lines on a darkened strip at the top, broken where they are too long;
+    the strip's height in px."""
     font = _font(canvas)
     room = canvas.shape[1] - 3 * font['height']
-    broken = [(part, colour) for text, colour in lines for part in textwrap.wrap(text, max(8, int(len(text) * room / max(_length(text, font), 1))))]
+    broken = [(part, colour) for text, colour in lines
+              for part in textwrap.wrap(text, max(8, int(len(text) * room / max(_length(text, font), 1))))]
     step = round(1.5 * font['height'])
     strip = step * len(broken) + font['height'] // 2
     _darken(canvas[:strip])
@@ -235,7 +250,8 @@ def _font(canvas: np.ndarray) -> dict:
     """Letters that can be read where the image is shown 512 px wide."""
     height = max(9, round(min(canvas.shape[:2]) / 46))
     thickness = max(1, height // 12)
-    return dict(height=height, scale=cv2.getFontScaleFromHeight(cv2.FONT_HERSHEY_SIMPLEX, height, thickness), thickness=thickness)
+    return dict(height=height, scale=cv2.getFontScaleFromHeight(cv2.FONT_HERSHEY_SIMPLEX, height, thickness),
+                thickness=thickness)
 
 
 def _length(text: str, font: dict) -> int:

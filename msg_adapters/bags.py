@@ -1,6 +1,7 @@
 """rosbag2 in and out (sqlite3 and MCAP, compressed or not) through the rosbags package; no ROS needed.
 
-What a bag gives are rosbags' dataclasses, which have the attributes of the ROS messages, so that the other adapters read them.
+What a bag gives are rosbags' dataclasses, which have the attributes of the ROS messages, so that the other adapters
+read them.
 """
 
 from __future__ import annotations
@@ -50,21 +51,25 @@ class Recorded:
 class BagReader:
     """An open bag; made by `open_bag`. What is damaged is stepped over and noted in `damage`, in one line.
 
-    `files` are its storage files, unpacked; `announced` is what metadata.yaml says: topic to the number of its messages. What is not there at all
-    of it is in `missing`, in words: it may be of no interest.
+    `files` are its storage files, unpacked; `announced` is what metadata.yaml says: topic to the number of its
+    messages. What is not there at all of it is in `missing`, in words: it may be of no interest.
     """
 
-    def __init__(self, path: Path, files: list[Path], reader: AnyReader | None, announced: dict[str, int], damage: str = ''):
+    def __init__(self, path: Path, files: list[Path], reader: AnyReader | None, announced: dict[str, int],
+                 damage: str = ''):
         self._path, self._files, self._reader = path, files, reader
         self._salvage: Salvage | None = None
         self.damage = ''
         self._topics = self._salvaged().topics if reader is None else _counted(reader)
         less = [topic for topic, count in announced.items() if count > self._topics.get(topic, ('', 0))[1]]
-        if reader is not None and any(self._salvaged().topics.get(topic, ('', 0))[1] > self._topics.get(topic, ('', 0))[1] for topic in less):
+        if reader is not None and any(self._salvaged().topics.get(topic, ('', 0))[1]
+                                      > self._topics.get(topic, ('', 0))[1] for topic in less):
             reader.close()      # it tells of less than there is
             self._reader, self._topics = None, self._salvaged().topics
-        self.missing = '; '.join(f'{announced[topic]} messages on {topic} are announced, and none is there' for topic in less if topic not in self._topics)
-        self._topics = {topic: (kind, max(count, announced.get(topic, 0))) for topic, (kind, count) in self._topics.items()}
+        self.missing = '; '.join(f'{announced[topic]} messages on {topic} are announced, and none is there'
+                                 for topic in less if topic not in self._topics)
+        self._topics = {topic: (kind, max(count, announced.get(topic, 0)))
+                        for topic, (kind, count) in self._topics.items()}
         if damage:
             self._note(damage)
         elif self._reader is None and (faults := [fault for fault in self.faults if fault != ROS_1]):
@@ -93,8 +98,10 @@ class BagReader:
         """Number of messages on `topics` by the bag's own account."""
         return sum(count for topic, (_, count) in self._topics.items() if topic in topics)
 
-    def messages(self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[Recorded]:
-        """The messages on `topics` in the order of their log times (of a damaged bag: of its files), from `start_ns` to before `stop_ns`."""
+    def messages(self, topics: Collection[str], start_ns: int | None = None,
+                 stop_ns: int | None = None) -> Iterator[Recorded]:
+        """The messages on `topics` in the order of their log times (of a damaged bag: of its files), from `start_ns` to
+        before `stop_ns`."""
         stream, seen = self._raw_messages(topics, start_ns, stop_ns), 0
         for topic, kind, log_ns, raw in stream:
             seen += 1
@@ -169,7 +176,8 @@ def open_bag(path: str | Path) -> Iterator[BagReader]:
         bag = BagReader(path, files, reader, announced, damages[0] if damages else '')
         try:
             if not reader and not bag.types():
-                why = ROS_1 + '; convert it to ROS 2 first' if ROS_1 in bag.faults else damages[0] if damages else reason
+                why = (ROS_1 + '; convert it to ROS 2 first' if ROS_1 in bag.faults else damages[0] if damages
+                       else reason)
                 raise BadBag(f'{path}: can\'t be read as a bag ({why})')
             yield bag
         finally:
@@ -177,11 +185,13 @@ def open_bag(path: str | Path) -> Iterator[BagReader]:
 
 
 def _announced(metadata: Path) -> dict[str, int]:
-    """Topic to the number of its messages, as a metadata.yaml of any version says. Raises ValueError where it makes no sense, in words."""
+    """Topic to the number of its messages, as a metadata.yaml of any version says. Raises ValueError where it makes no
+    sense, in words."""
     import yaml
 
     try:
-        topics = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']['topics_with_message_count']
+        topics = yaml.safe_load(
+            metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']['topics_with_message_count']
         told = [(t['topic_metadata']['name'], t['topic_metadata']['type'], t['message_count']) for t in topics or ()]
     except FileNotFoundError:
         raise ValueError('metadata.yaml is missing') from None
@@ -190,7 +200,8 @@ def _announced(metadata: Path) -> dict[str, int]:
     counts: dict[str, int] = {}
     for name, kind, count in told:
         if not (isinstance(name, str) and isinstance(kind, str) and type(count) is int and count >= 0):
-            raise ValueError(f'metadata.yaml makes no sense: topic {name!r:.40} has {count!r:.40} messages of type {kind!r:.40}')
+            raise ValueError(f'metadata.yaml makes no sense: topic {name!r:.40} has {count!r:.40} messages of type '
+                             f'{kind!r:.40}')
         counts[name] = counts.get(name, 0) + count
     return counts
 
@@ -203,8 +214,10 @@ def _opened(files: list[Path]) -> tuple[AnyReader | None, str]:
     try:
         reader = AnyReader(files, default_typestore=_jazzy())
         reader.open()
-        if wrong := [c for c in reader.connections if not (isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int))]:
-            raise TypeError(f'topic {wrong[0].topic!r:.40} has {wrong[0].msgcount!r:.40} messages of type {wrong[0].msgtype!r:.40}')
+        if wrong := [c for c in reader.connections
+                     if not (isinstance(c.topic, str) and isinstance(c.msgtype, str) and isinstance(c.msgcount, int))]:
+            raise TypeError(f'topic {wrong[0].topic!r:.40} has {wrong[0].msgcount!r:.40} messages of type '
+                            f'{wrong[0].msgtype!r:.40}')
     except Exception as error:  # on a damaged file rosbags raises anything from struct.error to AssertionError
         if reader is not None and reader.stack:
             reader.close()
@@ -221,7 +234,8 @@ def _counted(reader: AnyReader) -> dict[str, tuple[str, int]]:
 
 
 def _message(raw: bytes, kind: str, typestore: Any = None) -> Any:
-    """A message by our own definition of its type, since those in a bag may be empty, else by that of `typestore`. What is more than it is padding."""
+    """A message by our own definition of its type, since those in a bag may be empty, else by that of `typestore`. What
+    is more than it is padding."""
     ours = _jazzy()
     typestore = ours if kind in ours.fielddefs or typestore is None else typestore
     try:
@@ -253,7 +267,8 @@ class BagWriter:
             self._connections[topic] = self._writer.add_connection(topic, type_name, typestore=self._typestore)
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
-        """Append a message (made with `new`, or read from another bag) to a declared topic. Raises BadBag where there is no room."""
+        """Append a message (made with `new`, or read from another bag) to a declared topic. Raises BadBag where there
+        is no room."""
         self.write_raw(topic, self._typestore.serialize_cdr(message, self._connections[topic].msgtype), log_ns)
 
     def write_raw(self, topic: str, raw: bytes | memoryview, log_ns: int) -> None:
@@ -264,14 +279,17 @@ class BagWriter:
 
 @contextmanager
 def create_bag(path: str | Path, storage: str | None = None) -> Iterator[BagWriter]:
-    """A new rosbag2 directory at `path`; `storage` is mcap or sqlite3, by default what the suffix says (.db3: sqlite3, else mcap).
+    """A new rosbag2 directory at `path`; `storage` is mcap or sqlite3, by default what the suffix says (.db3: sqlite3,
+    else mcap).
 
-    Nothing is ever overwritten, and nothing stays when it ends in an error. Raises BadBag where `path` exists or can't be written.
+    Nothing is ever overwritten, and nothing stays when it ends in an error. Raises BadBag where `path` exists or can't
+    be written.
     """
     path = Path(path)
     if path.exists() or path.is_symlink():
         raise BadBag(f'{path} exists already and is not overwritten')
-    writer = Writer(path, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage or _SUFFIXES.get(path.suffix, 'mcap')])
+    writer = Writer(path, version=Writer.VERSION_LATEST,
+                    storage_plugin=STORAGES[storage or _SUFFIXES.get(path.suffix, 'mcap')])
     with _written(path):
         writer.open()
     try:

@@ -18,7 +18,8 @@ class BadCalibration(ValueError):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a calibration file says of one plane; the fields of sensor_msgs/CameraInfo that do not change from image to image."""
+    """What a calibration file says of one plane; the fields of sensor_msgs/CameraInfo that do not change from image to
+    image."""
 
     camera_name: str
     width: int          # px
@@ -38,8 +39,9 @@ _MATRICES = {'K': ('camera_matrix', (3, 3)), 'P': ('projection_matrix', (3, 4)),
 def read_calibration(path: str | Path) -> Calibration:
     """The calibration in the file `path`; `calibration_files` reads those of other programs.
 
-    `rectification_matrix`, `distortion_model` and `distortion_coefficients` may be missing: none. Whether it can be a camera is for
-    `camera_info_to_view` to say. Raises BadCalibration, OSError where there is no such file and ImportError without PyYAML.
+    `rectification_matrix`, `distortion_model` and `distortion_coefficients` may be missing: none. Whether it can be a
+    camera is for `camera_info_to_view` to say. Raises BadCalibration, OSError where there is no such file and
+    ImportError without PyYAML.
     """
     try:
         return calibration_from(yaml_mapping(Path(path).read_bytes().decode()))
@@ -67,8 +69,10 @@ def calibration_from(content: dict) -> Calibration:
     try:
         matrices = {key: _matrix(content[name], shape, name) for key, (name, shape) in _MATRICES.items()
                     if name in content or key in ('K', 'P')}
-        return Calibration(camera_name=str(content.get('camera_name', '')), width=_size(content['image_width'], 'image_width'),
-                           height=_size(content['image_height'], 'image_height'), distortion_model=str(content.get('distortion_model') or ''), **matrices)
+        return Calibration(camera_name=str(content.get('camera_name', '')),
+                           width=_size(content['image_width'], 'image_width'),
+                           height=_size(content['image_height'], 'image_height'),
+                           distortion_model=str(content.get('distortion_model') or ''), **matrices)
     except KeyError as error:
         raise BadCalibration(f'{error.args[0]} is missing') from None
 
@@ -99,8 +103,8 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
         m = np.atleast_2d(m)
         return {'rows': m.shape[0], 'cols': m.shape[1], 'data': m.ravel().tolist()}
 
-    content = {'image_width': calibration.width, 'image_height': calibration.height, 'camera_name': calibration.camera_name,
-               'distortion_model': calibration.distortion_model}
+    content = {'image_width': calibration.width, 'image_height': calibration.height,
+               'camera_name': calibration.camera_name, 'distortion_model': calibration.distortion_model}
     content |= {name: entry(getattr(calibration, key)) for key, (name, _) in _MATRICES.items()}
     Path(path).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 

@@ -1,7 +1,8 @@
-"""Calibration files of other programs, as what the camera_info YAML format would say of their cameras; `docs/connect.md` has the formulae.
+"""Calibration files of other programs, as what the camera_info YAML format would say of their cameras;
+`docs/connect.md` has the formulae.
 
-Every camera becomes P = K [R | t], reference frame to undistorted pixels whose centres lie at integers. Of a stereo pair the reference frame is the
-optical frame of the first camera.
+Every camera becomes P = K [R | t], reference frame to undistorted pixels whose centres lie at integers. Of a stereo
+pair the reference frame is the optical frame of the first camera.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ FARTHEST = 10.0         # m from the reference frame's origin to a source or cam
 
 
 def read_cameras(*paths: str | Path) -> list[Found]:
-    """The cameras in a file in order: one, or those of a stereo pair or chain. Of OpenCV's matrices several files together may have them.
+    """The cameras in a file in order: one, or those of a stereo pair or chain. Of OpenCV's matrices several files
+    together may have them.
 
-    Read are camera_info YAML, ROS's ost.txt, XMALab's and Autoscoper's MayaCam 2.0 and VTK cameras, Kalibr's camchain, OpenCV's FileStorage (YAML, XML,
-    JSON), and npz and MAT files with OpenCV's matrices or MATLAB's stereoParameters. Raises BadCalibration, OSError where there is no such file,
-    and ImportError without PyYAML.
+    Read are camera_info YAML, ROS's ost.txt, XMALab's and Autoscoper's MayaCam 2.0 and VTK cameras, Kalibr's camchain,
+    OpenCV's FileStorage (YAML, XML, JSON), and npz and MAT files with OpenCV's matrices or MATLAB's stereoParameters.
+    Raises BadCalibration, OSError where there is no such file, and ImportError without PyYAML.
     """
     path: str | Path = ''
     named: dict[str, object] = {}
@@ -41,7 +43,8 @@ def read_cameras(*paths: str | Path) -> list[Found]:
         return named_cameras(named)
     except BadCalibration as error:
         raise BadCalibration(f'{path}: {error}') from None
-    except (TypeError, ValueError, OverflowError) as error:     # NumPy's, of values that are no numbers or too large for one
+    except (TypeError, ValueError, OverflowError) as error:
+        # NumPy's, of values that are no numbers or too large for one
         raise BadCalibration(f'{path}: has something in it that is no number, or no matrix') from error
 
 
@@ -78,11 +81,14 @@ def _contents(path: Path) -> list[Found] | dict[str, object]:
 def in_metres(cameras: list[Found], unit: str = '') -> tuple[list[Calibration], str]:
     """The calibrations of planes that belong together with lengths in m, and a line where that was not what they had.
 
-    `unit` wins over what the files say; where neither does, cameras that would stand more than FARTHEST from the origin have millimetres.
+    `unit` wins over what the files say; where neither does, cameras that would stand more than FARTHEST from the origin
+    have millimetres.
     """
     said = unit or next((c.unit for c in cameras if c.unit), '')
-    finite = [c.calibration.P for c in cameras if np.isfinite(c.calibration.P).all()]       # what others are is said when they are used
-    distance = max((float(np.linalg.norm(np.linalg.lstsq(P[:, :3], P[:, 3], rcond=None)[0])) for P in finite), default=0.0)
+    # what others are is said when they are used
+    finite = [c.calibration.P for c in cameras if np.isfinite(c.calibration.P).all()]
+    distance = max((float(np.linalg.norm(np.linalg.lstsq(P[:, :3], P[:, 3], rcond=None)[0])) for P in finite),
+                   default=0.0)
     found = said or ('mm' if distance > FARTHEST else 'm')
     scaled = [dataclasses.replace(c.calibration, P=c.calibration.P * [1, 1, 1, UNITS[found]]) for c in cameras]
     if found == 'm' or unit:

@@ -14,7 +14,8 @@ NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 
 
 def mayacam(lines: list[str]) -> Found:
-    """MayaCam 2.0: sections 'image size' (width, height), 'camera matrix', 'rotation', 'translation': K, R and t of OpenCV."""
+    """MayaCam 2.0: sections 'image size' (width, height), 'camera matrix', 'rotation', 'translation': K, R and t of
+    OpenCV."""
     sections: dict[str, list[float]] = {}
     name = ''
     for line in lines:
@@ -24,7 +25,8 @@ def mayacam(lines: list[str]) -> Found:
         else:
             sections[name] += map(float, re.findall(NUMBER, line))
     size, K, R, t = (sections.get(key, []) for key in ('image size', 'camera matrix', 'rotation', 'translation'))
-    for key, values, count in (('image size', size, 2), ('camera matrix', K, 9), ('rotation', R, 9), ('translation', t, 3)):
+    for key, values, count in (('image size', size, 2), ('camera matrix', K, 9), ('rotation', R, 9),
+                               ('translation', t, 3)):
         if len(values) != count:
             raise BadCalibration(f'MayaCam 2.0: {key} has {len(values)} numbers instead of {count}')
     D = sections.get('distortion', [])
@@ -32,9 +34,12 @@ def mayacam(lines: list[str]) -> Found:
 
 
 def vtk_camera(lines: list[str]) -> Found:
-    """Autoscoper's VTK camera: where it stands, where it looks, what is up, and its angle of view in degrees, as far as width and height each."""
-    values = {key.strip(): [float(v) for v in re.findall(NUMBER, value)] for key, _, value in (line.partition(':') for line in lines if not line.startswith('#'))}
-    counts = {'camera-position': 3, 'focal-point': 3, 'view-up': 3, 'view-angle': 1, 'image-width': 1, 'image-height': 1}
+    """Autoscoper's VTK camera: where it stands, where it looks, what is up, and its angle of view in degrees, as far as
+    width and height each."""
+    values = {key.strip(): [float(v) for v in re.findall(NUMBER, value)]
+              for key, _, value in (line.partition(':') for line in lines if not line.startswith('#'))}
+    counts = {'camera-position': 3, 'focal-point': 3, 'view-up': 3, 'view-angle': 1, 'image-width': 1,
+              'image-height': 1}
     for key, count in counts.items():
         if len(values.get(key, ())) != count:
             raise BadCalibration(f'VTK camera: {key} has {len(values.get(key, ()))} numbers instead of {count}')
@@ -54,7 +59,8 @@ def vtk_camera(lines: list[str]) -> Found:
 
 
 def ost(lines: list[str]) -> list[Found]:
-    """ROS's ost.txt (INI): [image] with width and height, then a section a camera with camera matrix, distortion, rectification and projection."""
+    """ROS's ost.txt (INI): [image] with width and height, then a section a camera with camera matrix, distortion,
+    rectification and projection."""
     sections: dict[str, dict[str, list[float]]] = {}
     cameras, name, key = [], '', ''
     for line in lines:
@@ -72,10 +78,12 @@ def ost(lines: list[str]) -> list[Found]:
     for name, section in sections.items():
         if 'projection' not in section:
             continue
-        parts = {key: section.get(long, []) for key, long in (('K', 'camera matrix'), ('R', 'rectification'), ('P', 'projection'), ('D', 'distortion'))}
+        parts = {key: section.get(long, []) for key, long in (('K', 'camera matrix'), ('R', 'rectification'),
+                                                              ('P', 'projection'), ('D', 'distortion'))}
         if [len(parts[key]) for key in 'KRP'] != [9, 9, 12]:
             raise BadCalibration(f'[{short(name)}] needs camera matrix, rectification and projection')
-        cameras.append(Found(Calibration(name, width, height, np.reshape(parts['K'], (3, 3)), np.reshape(parts['P'], (3, 4)), model_of(parts['D']), np.array(parts['D']),
+        cameras.append(Found(Calibration(name, width, height, np.reshape(parts['K'], (3, 3)),
+                                         np.reshape(parts['P'], (3, 4)), model_of(parts['D']), np.array(parts['D']),
                                          np.reshape(parts['R'], (3, 3)))))
     if not cameras:
         raise BadCalibration('no camera with a projection in it')
@@ -90,15 +98,18 @@ def kalibr(content: dict) -> list[Found]:
         name = f'cam{len(cameras)}'
         try:
             if camera.get('camera_model') != 'pinhole':
-                raise BadCalibration(f'{name} is {short(str(camera.get("camera_model")))}; only pinhole cameras are read')
+                raise BadCalibration(f'{name} is {short(str(camera.get("camera_model")))}; '
+                                     'only pinhole cameras are read')
             if cameras:
                 pose = np.array(camera['T_cn_cnm1'], float).reshape(4, 4) @ pose
             (fu, fv, cu, cv), (width, height) = map(float, camera['intrinsics']), map(int, camera['resolution'])
-            D, model = np.array(camera.get('distortion_coeffs') or [], float), str(camera.get('distortion_model', 'none'))
+            D, model = (np.array(camera.get('distortion_coeffs') or [], float),
+                        str(camera.get('distortion_model', 'none')))
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, BadCalibration):
                 raise
             raise BadCalibration(f'{name} needs intrinsics, resolution and, but the first, T_cn_cnm1') from None
         model = {'radtan': 'plumb_bob', 'none': ''}.get(model, model)
-        cameras.append(assembled(name, (width, height), [[fu, 0, cu], [0, fv, cv], [0, 0, 1]], D, model, pose[:3, :3], pose[:3, 3], 'm'))
+        cameras.append(assembled(name, (width, height), [[fu, 0, cu], [0, fv, cv], [0, 0, 1]], D, model, pose[:3, :3],
+                                 pose[:3, 3], 'm'))
     return cameras

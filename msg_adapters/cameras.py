@@ -16,10 +16,12 @@ from fluoro_shape_ros.geometry.cameras import GeometryError, decompose, make_vie
 from .messages import short
 
 LARGEST = 1e12      # no entry of a camera's matrices is beyond that, and arithmetic with it does not overflow
-LONGEST = 256       # characters of a frame_id, which every message of a result repeats, or of a model; coefficients of any kind
+LONGEST = 256       # characters of a frame_id, which every message of a result repeats, or of a model;
+                    # coefficients of any kind
 NO_POSE = 1e-6         # rad and m: a pose smaller than that is none
 MOST_COEFFICIENTS = 14      # that OpenCV knows
-COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}      # how many D may have, but for zeros after them
+# how many D may have, but for zeros after them
+COEFFICIENTS = {'plumb_bob': (4, 5), 'rational_polynomial': (8, 12, 14), 'equidistant': (4,)}
 NAMES = {'fisheye': 'equidistant'}      # of models that others call otherwise
 
 
@@ -28,22 +30,26 @@ class BadCameraInfo(ValueError):
 
 
 def check_lengths(msg: Any, name: str) -> None:
-    """Raises BadCameraInfo where what has no limit in plane `name`'s sensor_msgs/CameraInfo is too long to be kept, compared and repeated."""
+    """Raises BadCameraInfo where what has no limit in plane `name`'s sensor_msgs/CameraInfo is too long to be kept,
+    compared and repeated."""
     if len(msg.header.frame_id) > LONGEST:
-        raise BadCameraInfo(f'plane {name}: its frame_id has {len(msg.header.frame_id)} characters, more than {LONGEST}')
+        raise BadCameraInfo(f'plane {name}: its frame_id has {len(msg.header.frame_id)} characters, '
+                            f'more than {LONGEST}')
     if len(msg.distortion_model) > LONGEST:
-        raise BadCameraInfo(f'plane {name}: distortion model "{short(msg.distortion_model)}" has {len(msg.distortion_model)} characters, more than {LONGEST}')
+        raise BadCameraInfo(f'plane {name}: distortion model "{short(msg.distortion_model)}" has '
+                            f'{len(msg.distortion_model)} characters, more than {LONGEST}')
     if len(msg.d) > LONGEST or len(msg.d) > MOST_COEFFICIENTS and any(msg.d):     # zeros are a pinhole, however many
         raise BadCameraInfo(f'plane {name}: D has {len(msg.d)} coefficients, more than {MOST_COEFFICIENTS}')
 
 
 def camera_info_to_view(msg: Any, name: str, image_shape: tuple[int, int], *, rectified: bool = False,
                         pose: tuple[np.ndarray, np.ndarray] | None = None) -> View:
-    """The View of plane `name` ('a' or 'b') for an image of `image_shape` (H, W) as received, from a sensor_msgs/CameraInfo.
+    """The View of plane `name` ('a' or 'b') for an image of `image_shape` (H, W) as received, from a
+    sensor_msgs/CameraInfo.
 
-    `P` maps the reference frame (m) to pixels; with `pose`, a pair R (3, 3), t (3,) of camera_from_reference, only its left 3x3 counts.
-    `rectified` says that the image is free of distortion already: D and R are ignored. K and P refer to the full resolution;
-    the image may be a region of it (`roi`) and binned. Raises BadCameraInfo.
+    `P` maps the reference frame (m) to pixels; with `pose`, a pair R (3, 3), t (3,) of camera_from_reference, only its
+    left 3x3 counts. `rectified` says that the image is free of distortion already: D and R are ignored. K and P refer
+    to the full resolution; the image may be a region of it (`roi`) and binned. Raises BadCameraInfo.
     """
     try:
         to_image = _image_from_full(msg, image_shape)
@@ -60,7 +66,8 @@ def camera_info_to_view(msg: Any, name: str, image_shape: tuple[int, int], *, re
 
 
 def has_pose(msg: Any) -> bool:
-    """Whether P of a valid sensor_msgs/CameraInfo is not K [I | 0]: it takes points from another frame than the camera's own."""
+    """Whether P of a valid sensor_msgs/CameraInfo is not K [I | 0]: it takes points from another frame than the
+    camera's own."""
     _, R, t = decompose(np.reshape(msg.p, (3, 4)).astype(float))
     return bool(np.abs(R - np.eye(3)).max() > NO_POSE or np.abs(t).max() > NO_POSE)
 
@@ -73,13 +80,15 @@ def _image_from_full(msg: Any, image_shape: tuple[int, int]) -> np.ndarray:
     offset = np.array([msg.roi.x_offset, msg.roi.y_offset], float)
     region = np.where([msg.roi.width, msg.roi.height], [msg.roi.width, msg.roi.height], full)   # 0: all of it
     if (offset + region > full).any():
-        raise BadCameraInfo(f'its roi ({region[0]:g}x{region[1]:g} at {offset[0]:g}, {offset[1]:g}) leaves the sensor ({msg.width}x{msg.height})')
+        raise BadCameraInfo(f'its roi ({region[0]:g}x{region[1]:g} at {offset[0]:g}, '
+                            f'{offset[1]:g}) leaves the sensor ({msg.width}x{msg.height})')
     binning = np.maximum([msg.binning_x, msg.binning_y], 1)     # 0: none
     width, height = (region // binning).astype(int)
     if width < 1 or height < 1:
         raise BadCameraInfo(f'its binning ({binning[0]}x{binning[1]}) leaves no pixel of {region[0]:g}x{region[1]:g}')
     if (height, width) != tuple(image_shape):
-        raise BadCameraInfo(f'CameraInfo is for {width}x{height} images (roi and binning counted), but the image is {image_shape[1]}x{image_shape[0]}')
+        raise BadCameraInfo(f'CameraInfo is for {width}x{height} images (roi and binning counted), '
+                            f'but the image is {image_shape[1]}x{image_shape[0]}')
     # pixel centres lie at integers: u = (u_full - offset + 1/2) / binning - 1/2
     return np.array([[1 / binning[0], 0.0, (0.5 - offset[0]) / binning[0] - 0.5],
                      [0.0, 1 / binning[1], (0.5 - offset[1]) / binning[1] - 0.5],
@@ -102,7 +111,8 @@ def _matrix(values: ArrayLike, name: str, shape: tuple[int, int]) -> np.ndarray:
 def _intrinsics(m: np.ndarray) -> np.ndarray:
     """The left 3x3 of a P whose pose is known from elsewhere."""
     if np.abs(m[np.tril_indices(3, -1)]).max() > 1e-6 * np.abs(m).max():
-        raise BadCameraInfo('P\'s left 3x3 holds a rotation; where the pose comes from tf it must be the intrinsics alone, upper triangular')
+        raise BadCameraInfo('P\'s left 3x3 holds a rotation; where the pose comes from tf it must be the intrinsics '
+                            'alone, upper triangular')
     return m
 
 
@@ -122,7 +132,7 @@ def _distortion(msg: Any, K: np.ndarray) -> Distortion | None:
         R = np.eye(3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise BadCameraInfo('R is no rotation')
-    if not D.any():     # as image_geometry has it, D of zeros is a pinhole under every model; R then still turns the rays
+    if not D.any():   # as image_geometry has it, D of zeros is a pinhole under every model; R then still turns the rays
         return None if np.allclose(R, np.eye(3), atol=1e-9) else Distortion('plumb_bob', K, np.zeros(5), R)
     if not model:
         raise BadCameraInfo(f'D is given, but no distortion model: it must be one of {", ".join(COEFFICIENTS)}')

@@ -21,9 +21,11 @@ from .messages import New, header
 OK, WARN, ERROR, STALE = range(4)   # diagnostic_msgs/DiagnosticStatus
 WINDOW_S = 3.0      # over which rates and latencies are taken, and after which a silent stream is stale
 MISSING = 0.1       # share of the images without a partner from which on that is told where they may get lost
-LOST = 'best-effort images get lost on their way; over UDP the receive buffers must hold one (net.core.rmem_max, see docs/connect.md)'
+LOST = ('best-effort images get lost on their way; over UDP the receive buffers must hold one '
+        '(net.core.rmem_max, see docs/connect.md)')
 # what no better image would mend: something is not connected or configured as it must be
-FAULTS = {Outcome.BAD_IMAGE, Outcome.BAD_CAMERA_INFO, Outcome.NO_CAMERA_INFO, Outcome.NO_TRANSFORM, Outcome.BAD_GEOMETRY, Outcome.INTERNAL_ERROR}
+FAULTS = {Outcome.BAD_IMAGE, Outcome.BAD_CAMERA_INFO, Outcome.NO_CAMERA_INFO, Outcome.NO_TRANSFORM,
+          Outcome.BAD_GEOMETRY, Outcome.INTERNAL_ERROR}
 
 
 @dataclass(frozen=True)
@@ -84,13 +86,15 @@ class ReconstructionSummary:
     silent_s: float | None = None   # since the last pair
     overdue_s: float = 0.0          # for how long the pair at work has been, where that is too long
     overdue: int = 0                # pairs that took too long
-    here: str = ''                  # why pairs are reconstructed in the node itself; empty where that is done in a process of its own ...
+    here: str = ''                  # why pairs are reconstructed in the node itself; empty where that is done in a
+                                    # process of its own ...
     restarts: int = 0               # ... and how often that was begun anew
     rate_hz: float = 0.0            # of results
     latency_s: tuple[float, ...] = ()       # of the last results: second image's arrival to publication
     outcomes: dict[str, int] = field(default_factory=dict)
     out_of_time: float = 0.0        # share of the pairs lately
-    refused: str = ''               # why most pairs were refused lately, in words; empty where any gave a result, or there was none
+    refused: str = ''               # why most pairs were refused lately, in words; empty where any gave a result, or
+                                    # there was none
 
 
 def plane_status(s: PlaneSummary) -> Status:
@@ -113,7 +117,8 @@ def plane_status(s: PlaneSummary) -> Status:
     else:
         level, message = OK, f'{s.rate_hz:.1f} images/s'
     return Status(f'plane {s.plane}', level, message, {
-        'images': s.images, 'rate (1/s)': f'{s.rate_hz:.1f}', 'bad images': s.bad_images, 'bad camera infos': s.bad_camera_infos,
+        'images': s.images, 'rate (1/s)': f'{s.rate_hz:.1f}', 'bad images': s.bad_images,
+        'bad camera infos': s.bad_camera_infos,
         'camera info': 'known' if s.has_camera else 'none', 'reliability': s.reliability, 'publishers': s.publishers})
 
 
@@ -134,17 +139,19 @@ def pairing_status(s: PairingSummary) -> Status:
     elif s.jumped:
         level, message = WARN, 'stamps jumped back: everything before was forgotten'
     elif quiet and s.both_alive and s.gap_s is not None:
-        level, message = WARN, f'nothing pairs: the newest stamps differ by {abs(s.gap_s) * 1e3:.1f} ms, sync_slop is {s.slop_s * 1e3:.1f} ms'
+        level, message = (WARN, f'nothing pairs: the newest stamps differ by {abs(s.gap_s) * 1e3:.1f} ms, '
+                                f'sync_slop is {s.slop_s * 1e3:.1f} ms')
         message += f'; or {LOST}' if missing > MISSING else ''
     elif quiet:
         level, message = STALE, 'no pair yet' if s.silent_s is None else f'no pair for {s.silent_s:.0f} s'
     elif missing > MISSING:
         level, message = WARN, f'{100 * missing:.0f} % of the images have no partner: {LOST}'
     else:
-        level, message = OK, f'{s.rate_hz:.1f} pairs/s' + (f', {s.dropped_hz:.1f} of them dropped: they come faster than they are processed' if s.dropped_hz else '')
+        level, message = OK, f'{s.rate_hz:.1f} pairs/s' + (f', {s.dropped_hz:.1f} of them dropped: they come faster '
+                                                           'than they are processed' if s.dropped_hz else '')
     return Status('pairing', level, message, {
-        'pairs': c.pairs, 'rate (1/s)': f'{s.rate_hz:.1f}', 'dropped': s.dropped, 'unpaired': c.unpaired, 'out of order': c.out_of_order,
-        'duplicates': c.duplicates, 'unstamped': c.unstamped, 'jumps back': c.jumps})
+        'pairs': c.pairs, 'rate (1/s)': f'{s.rate_hz:.1f}', 'dropped': s.dropped, 'unpaired': c.unpaired,
+        'out of order': c.out_of_order, 'duplicates': c.duplicates, 'unstamped': c.unstamped, 'jumps back': c.jumps})
 
 
 def reconstruction_status(s: ReconstructionSummary) -> Status:
@@ -168,13 +175,18 @@ def reconstruction_status(s: ReconstructionSummary) -> Status:
     elif notes:
         level, message = WARN, '; '.join(notes)
     else:
-        level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images' if ms else '')
+        level, message = OK, f'{s.rate_hz:.1f} results/s' + (f', {statistics.median(ms):.0f} ms after their images'
+                                                             if ms else '')
         message += f', {100 * s.out_of_time:.0f} % of the pairs out of time' if s.out_of_time else ''
-    values = {'last outcome': last, 'last detail': s.detail, 'confidence': probability(s.confidence), 'warnings': ', '.join(s.warnings),
-              'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction, 'overdue pairs': s.overdue, 'out of time (%)': f'{100 * s.out_of_time:.0f}',
-              'calibration_watch': s.calibration, 'process': f'the node itself: {s.here}' if s.here else 'its own', 'reconstruction restarted': s.restarts,
-              'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '', 'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
-    return Status('reconstruction', level, message, {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
+    values = {'last outcome': last, 'last detail': s.detail, 'confidence': probability(s.confidence),
+              'warnings': ', '.join(s.warnings),
+              'rate (1/s)': f'{s.rate_hz:.1f}', 'mask': s.mask, 'prediction': s.prediction, 'overdue pairs': s.overdue,
+              'out of time (%)': f'{100 * s.out_of_time:.0f}', 'calibration_watch': s.calibration,
+              'process': f'the node itself: {s.here}' if s.here else 'its own', 'reconstruction restarted': s.restarts,
+              'latency median (ms)': f'{statistics.median(ms):.1f}' if ms else '',
+              'latency max (ms)': f'{max(ms):.1f}' if ms else ''}
+    return Status('reconstruction', level, message,
+                  {**values, **{f'count {name}': n for name, n in sorted(s.outcomes.items())}})
 
 
 def trouble(planes: list[PlaneSummary], pairing: PairingSummary, results: ReconstructionSummary) -> str:
@@ -182,7 +194,8 @@ def trouble(planes: list[PlaneSummary], pairing: PairingSummary, results: Recons
     if not results.enabled or results.capturing or results.rate_hz:
         return ''
     missing, pairs = [s for s in map(plane_status, planes) if s.level in (STALE, ERROR)], pairing_status(pairing)
-    return '; '.join(f'{s.name}: {s.message}' for s in missing) or results.refused or (pairs.message if pairs.level in (WARN, ERROR) else '')
+    return ('; '.join(f'{s.name}: {s.message}' for s in missing) or results.refused
+            or (pairs.message if pairs.level in (WARN, ERROR) else ''))
 
 
 def probability(value: float) -> str:
@@ -193,7 +206,8 @@ def probability(value: float) -> str:
 def diagnostic_array(statuses: list[Status], stamp_ns: int, node_name: str, new: New) -> Any:
     """A diagnostic_msgs/DiagnosticArray; `new` is a factory (see messages)."""
     return new('diagnostic_msgs/msg/DiagnosticArray', header=header(new, stamp_ns, ''), status=[
-        new('diagnostic_msgs/msg/DiagnosticStatus', level=s.level, name=f'{node_name}: {s.name}', message=s.message, hardware_id=node_name,
+        new('diagnostic_msgs/msg/DiagnosticStatus', level=s.level, name=f'{node_name}: {s.name}', message=s.message,
+            hardware_id=node_name,
             values=[new('diagnostic_msgs/msg/KeyValue', key=k, value=str(v)) for k, v in s.values.items()])
         for s in statuses])
 
@@ -266,20 +280,26 @@ class Tally:
                             bad_camera_infos=self.count(f'bad {camera}'), camera_fault=self.reason(camera), **known)
 
     def pairing(self, counts: Counts, **known: Any) -> PairingSummary:
-        return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'), dropped_hz=self.rate_hz('dropped'), silent_s=self.silent_s('pair'),
-                              both_alive=self.lately('image a') and self.lately('image b'), unstamped=self.lately('unstamped'),
+        return PairingSummary(counts, rate_hz=self.rate_hz('pair'), dropped=self.count('dropped'),
+                              dropped_hz=self.rate_hz('dropped'), silent_s=self.silent_s('pair'),
+                              both_alive=self.lately('image a') and self.lately('image b'),
+                              unstamped=self.lately('unstamped'),
                               jumped=self.lately('jump'), unpaired_hz=self.rate_hz('unpaired'), **known)
 
     def reconstruction(self, **known: Any) -> ReconstructionSummary:
         done, good = self._result, f'outcome {Outcome.OK.value}'
         with self._lock:
             latency = tuple(value for _, value in self._recent(good, self._clock()))
-            outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items() if name.startswith('outcome ')}
+            outcomes = {name.removeprefix('outcome '): n for name, n in self._counts.items()
+                        if name.startswith('outcome ')}
             lately = {name: len(self._recent(f'outcome {name}', self._clock())) for name in outcomes}
-        seen: dict[str, Any] = {} if done is None else dict(outcome=done.outcome, detail=done.detail, warnings=done.warnings, confidence=done.confidence,
+        seen: dict[str, Any] = {} if done is None else dict(outcome=done.outcome, detail=done.detail,
+                                                            warnings=done.warnings, confidence=done.confidence,
                                                             prediction=done.prediction)
-        return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency, outcomes=outcomes,
-                                     overdue=self.count('overdue'), out_of_time=lately.get(Outcome.OUT_OF_TIME.value, 0) / max(sum(lately.values()), 1),
+        return ReconstructionSummary(silent_s=self.silent_s('answer'), rate_hz=self.rate_hz(good), latency_s=latency,
+                                     outcomes=outcomes,
+                                     overdue=self.count('overdue'), out_of_time=lately.get(Outcome.OUT_OF_TIME.value, 0)
+                                                                                / max(sum(lately.values()), 1),
                                      refused=self._refused(lately), **seen, **known)
 
     def _refused(self, lately: dict[str, int]) -> str:

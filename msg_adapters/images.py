@@ -1,7 +1,7 @@
 """sensor_msgs/Image and CompressedImage to arrays and back.
 
-Any object with the fields of the message will do: rclpy's and rosbags' messages alike. Grey values keep their depth; nothing is
-scaled or cut to 8 bits.
+Any object with the fields of the message will do: rclpy's and rosbags' messages alike. Grey values keep their depth;
+nothing is scaled or cut to 8 bits.
 """
 
 from __future__ import annotations
@@ -46,9 +46,11 @@ ENCODINGS = {
     'yuv422_yuy2': _Encoding(_U8, 2, cv2.COLOR_YUV2GRAY_YUY2),
 }
 LUMINANCE_FIRST = ('nv12', 'nv21')      # all of it, and then half as many rows of colour
-MAX_PIXELS = 2**24      # 4096 x 4096, finer than X-ray detectors are: reconstructing a pair of these takes some seconds and 1.2 GB
+MAX_PIXELS = 2**24      # 4096 x 4096, finer than X-ray detectors are: reconstructing a pair of these takes some seconds
+                        # and 1.2 GB
 MAX_PARTS = 2**16       # of a file, that are looked at: a PNG of that size has some thousand chunks
-_WRITTEN_AS = {(_U8, 2): 'mono8', (_U16, 2): 'mono16', (_F32, 2): '32FC1', (_U8, 3): 'bgr8'}     # by dtype and number of dimensions
+# by dtype and number of dimensions
+_WRITTEN_AS = {(_U8, 2): 'mono8', (_U16, 2): 'mono16', (_F32, 2): '32FC1', (_U8, 3): 'bgr8'}
 
 
 def check_pixels(height: int, width: int) -> None:
@@ -61,7 +63,8 @@ def image_to_array(msg: Any) -> np.ndarray:
     """(H, W) uint8, uint16 or float32 in native byte order, from a sensor_msgs/Image.
 
     A read-only view of the message's memory where that is possible: one channel, native byte order, aligned.
-    Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, more than MAX_PIXELS, and values that are not finite.
+    Raises BadImage for an unknown encoding, zero size, step or data length that do not fit, more than MAX_PIXELS, and
+    values that are not finite.
     """
     if msg.encoding not in ENCODINGS and msg.encoding not in LUMINANCE_FIRST:
         raise BadImage(f'encoding "{short(msg.encoding)}" is not one of {", ".join((*ENCODINGS, *LUMINANCE_FIRST))}')
@@ -81,7 +84,9 @@ def image_to_array(msg: Any) -> np.ndarray:
     check_pixels(height, width)
     strides = (step, item, encoding.dtype.itemsize)
     # np.ndarray rather than reshape: a step need not be a multiple of the item size
-    array: np.ndarray = np.ndarray((height, width, encoding.channels), encoding.dtype.newbyteorder('>' if msg.is_bigendian else '<'), _bytes(msg.data), strides=strides)
+    array: np.ndarray = np.ndarray((height, width, encoding.channels),
+                                   encoding.dtype.newbyteorder('>' if msg.is_bigendian else '<'), _bytes(msg.data),
+                                   strides=strides)
     array = np.require(array, encoding.dtype, 'A')      # to native order and alignment, a copy only where they differ
     if encoding.to_grey is not None:
         return cv2.cvtColor(np.ascontiguousarray(array), encoding.to_grey)
@@ -89,7 +94,8 @@ def image_to_array(msg: Any) -> np.ndarray:
 
 
 def _bytes(data: Any) -> memoryview:
-    """The buffer of a message's data, read-only and without copying it: array.array, ndarray, bytes and memoryview alike."""
+    """The buffer of a message's data, read-only and without copying it: array.array, ndarray, bytes and memoryview
+    alike."""
     return np.frombuffer(data, np.uint8).data.toreadonly()
 
 
@@ -101,10 +107,12 @@ def _checked(array: np.ndarray) -> np.ndarray:
 
 
 def compressed_to_array(msg: Any) -> np.ndarray:
-    """(H, W) uint8 or uint16 from a sensor_msgs/CompressedImage that holds a PNG (8 or 16 bits) or a JPEG; colour becomes grey.
+    """(H, W) uint8 or uint16 from a sensor_msgs/CompressedImage that holds a PNG (8 or 16 bits) or a JPEG; colour
+    becomes grey.
 
-    The data says what it is; `format` ("png", "mono16; png compressed mono16", ...) is not believed. Raises BadImage for any other data, for
-    what can't be decoded or is cut short, and, before decoding it, for what says that it has more than MAX_PIXELS.
+    The data says what it is; `format` ("png", "mono16; png compressed mono16", ...) is not believed. Raises BadImage
+    for any other data, for what can't be decoded or is cut short, and, before decoding it, for what says that it has
+    more than MAX_PIXELS.
     """
     try:
         data = np.frombuffer(msg.data, np.uint8)
@@ -124,7 +132,8 @@ def _name(msg: Any) -> str:
 
 
 def _check_announced(data: np.ndarray) -> None:
-    """Raises BadImage, without decoding it, where a PNG or JPEG says that it is too large or ends too early, and for any other data."""
+    """Raises BadImage, without decoding it, where a PNG or JPEG says that it is too large or ends too early, and for
+    any other data."""
     if data[:8].tobytes() == b'\x89PNG\r\n\x1a\n':
         _check_png(data)
     elif data[:3].tobytes() == b'\xff\xd8\xff':
@@ -134,7 +143,8 @@ def _check_announced(data: np.ndarray) -> None:
 
 
 def _check_png(data: np.ndarray) -> None:
-    """All chunks (ISO/IEC 15948, 5.3 and 11.2.2): OpenCV makes room for whatever length one says it has, 2 GB for 80 bytes."""
+    """All chunks (ISO/IEC 15948, 5.3 and 11.2.2): OpenCV makes room for whatever length one says it has, 2 GB for 80
+    bytes."""
     at = 8
     for _ in range(MAX_PARTS):
         if at + 12 > len(data):
@@ -161,7 +171,8 @@ def _check_jpeg(data: np.ndarray) -> None:
         if 0xc0 <= marker <= 0xcf and marker not in (0xc4, 0xc8, 0xcc):     # start of frame
             height, width = struct.unpack_from('>HH', data, at + 5)
             check_pixels(height, width)
-            if data[at:].tobytes().rfind(b'\xff\xd9') < 0:      # end of image: without it, OpenCV 4 fills what is missing with grey
+            # end of image: without it, OpenCV 4 fills what is missing with grey
+            if data[at:].tobytes().rfind(b'\xff\xd9') < 0:
                 raise BadImage('a JPEG that is cut short')
             return
         at += 1 if marker == 0xff else 2 + length
@@ -169,7 +180,8 @@ def _check_jpeg(data: np.ndarray) -> None:
 
 
 def grey(array: np.ndarray) -> np.ndarray:
-    """(H, W) of an image as OpenCV reads it: grey, BGR or BGRA; uint8, uint16 or float32. Raises BadImage for any other."""
+    """(H, W) of an image as OpenCV reads it: grey, BGR or BGRA; uint8, uint16 or float32. Raises BadImage for any
+    other."""
     if array.dtype not in (_U8, _U16, _F32):
         raise BadImage(f'pixels of type {array.dtype} are not supported: uint8, uint16 and float32 are')
     if array.ndim == 3 and array.shape[2] == 1:
@@ -182,7 +194,8 @@ def grey(array: np.ndarray) -> np.ndarray:
 
 
 def array_to_image(array: np.ndarray, stamp_ns: int, frame_id: str, new: New) -> Any:
-    """A sensor_msgs/Image of an (H, W) uint8 (mono8), uint16 (mono16) or float32 (32FC1), or an (H, W, 3) uint8 (bgr8) array.
+    """A sensor_msgs/Image of an (H, W) uint8 (mono8), uint16 (mono16) or float32 (32FC1), or an (H, W, 3) uint8 (bgr8)
+    array.
 
     `new` is a factory (see messages). Raises BadImage for any other array.
     """
@@ -190,5 +203,6 @@ def array_to_image(array: np.ndarray, stamp_ns: int, frame_id: str, new: New) ->
     if encoding is None or 0 in array.shape or (array.ndim == 3 and array.shape[2] != 3):
         raise BadImage(f'no image encoding for an array of type {array.dtype} and shape {array.shape}')
     native = np.ascontiguousarray(array, ENCODINGS[encoding].dtype)
-    return new('sensor_msgs/msg/Image', header=header(new, stamp_ns, frame_id), height=array.shape[0], width=array.shape[1], encoding=encoding,
+    return new('sensor_msgs/msg/Image', header=header(new, stamp_ns, frame_id), height=array.shape[0],
+               width=array.shape[1], encoding=encoding,
                is_bigendian=int(sys.byteorder == 'big'), step=native.strides[0], data=native.reshape(-1).view(np.uint8))

@@ -1,7 +1,8 @@
 """Messages made without caring who made the library: rclpy's classes and the dataclasses of rosbags look alike.
 
-A factory is a callable `new('nav_msgs/msg/Path', header=..., poses=[...])`. Fields that are not given have their default; numeric
-sequences may be given as numpy arrays of any shape, `byte` fields as int. Reading needs no help: both kinds have the same attributes.
+A factory is a callable `new('nav_msgs/msg/Path', header=..., poses=[...])`. Fields that are not given have their
+default; numeric sequences may be given as numpy arrays of any shape, `byte` fields as int. Reading needs no help: both
+kinds have the same attributes.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ import numpy as np
 
 New = Callable[..., Any]        # the type of a factory; a message is of any type that has its fields
 
-_TYPECODES = {'uint8': 'B', 'octet': 'B', 'int8': 'b', 'uint16': 'H', 'int16': 'h', 'uint32': 'I', 'int32': 'i', 'uint64': 'Q', 'int64': 'q',
+_TYPECODES = {'uint8': 'B', 'octet': 'B', 'int8': 'b', 'uint16': 'H', 'int16': 'h', 'uint32': 'I', 'int32': 'i',
+              'uint64': 'Q', 'int64': 'q',
               'float': 'f', 'double': 'd'}      # of array.array, by the element type's name in ROS interfaces
 
 
 def ros_message(type_name: str, **fields: Any) -> Any:
-    """A real ROS message of type 'package/msg/Name'; imports the class when first asked. Raises ImportError where ROS is not installed."""
+    """A real ROS message of type 'package/msg/Name'; imports the class when first asked. Raises ImportError where ROS
+    is not installed."""
     cls, kinds = _ros_class(type_name)
     return cls(**{key: _ros_value(kinds[key], value) for key, value in fields.items()})
 
@@ -35,7 +38,8 @@ def _ros_class(type_name: str) -> tuple[Callable[..., Any], dict[str, str]]:
 
 
 def _ros_value(kind: str, value: Any) -> Any:
-    """`value` as rclpy wants it for a field of type `kind`: it takes arrays at once that have the right type, and checks others one by one."""
+    """`value` as rclpy wants it for a field of type `kind`: it takes arrays at once that have the right type, and
+    checks others one by one."""
     if kind == 'octet':
         return bytes([value])
     if not isinstance(value, np.ndarray):
@@ -49,13 +53,16 @@ def _ros_value(kind: str, value: Any) -> Any:
 
 
 def bag_message(typestore: Any) -> New:
-    """A factory of the messages that `typestore` (of rosbags) knows; these dataclasses need every field and numpy arrays."""
+    """A factory of the messages that `typestore` (of rosbags) knows; these dataclasses need every field and numpy
+    arrays."""
 
     @functools.cache
     def plan(type_name: str) -> tuple[Callable[..., Any], dict[str, Any], dict[str, np.dtype]]:
-        """The class, its fields, and which of them are numeric sequences, of what type; a Path asks for the same four hundreds of times."""
+        """The class, its fields, and which of them are numeric sequences, of what type; a Path asks for the same four
+        hundreds of times."""
         kinds = dict(typestore.fielddefs[type_name][1])
-        numeric = {name: _dtype(detail[0][1][0]) for name, (node, detail) in kinds.items() if node.name in ('ARRAY', 'SEQUENCE') and _is_numeric(detail[0])}
+        numeric = {name: _dtype(detail[0][1][0]) for name, (node, detail) in kinds.items()
+                   if node.name in ('ARRAY', 'SEQUENCE') and _is_numeric(detail[0])}
         return typestore.types[type_name], kinds, numeric
 
     def new(type_name: str, **fields: Any) -> Any:
@@ -98,7 +105,8 @@ def _bag_default(new: New, kind: Any) -> Any:
 def header(new: New, stamp_ns: int, frame_id: str) -> Any:
     """std_msgs/Header with a stamp in nanoseconds."""
     sec, nanosec = divmod(int(stamp_ns), 10**9)
-    return new('std_msgs/msg/Header', stamp=new('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec), frame_id=frame_id)
+    return new('std_msgs/msg/Header', stamp=new('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec),
+               frame_id=frame_id)
 
 
 def short(text: str, length: int = 40) -> str:

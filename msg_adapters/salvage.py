@@ -1,6 +1,8 @@
-"""What can still be read of a damaged bag: a recording that was cut off, lost its metadata.yaml, or has bad blocks in it.
+"""What can still be read of a damaged bag: a recording that was cut off, lost its metadata.yaml,
+or has bad blocks in it.
 
-Every file is read from its begin to the first thing that makes no sense; a bad chunk (MCAP) or row (sqlite3) before that is stepped over.
+Every file is read from its begin to the first thing that makes no sense; a bad chunk (MCAP) or row (sqlite3) before
+that is stepped over.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ import zstandard
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-STEPS, LAST_ROW = 1000, 2**63 - 1   # of sqlite3: instructions between two looks at how many it took, and the highest number of a row
+STEPS, LAST_ROW = 1000, 2**63 - 1   # of sqlite3: instructions between two looks at how many it took, and the highest
+                                    # number of a row
 ROWS_TRIED = 256                    # damaged rows in sequence after which nothing more is to be expected
 DAMAGED = sqlite3.DatabaseError, MemoryError       # what sqlite3 raises; the other one where a row says that it is huge
 SIZE_LIMIT = 2**30                  # bytes; what says that it is longer is damaged, or made to take all memory
@@ -46,11 +49,14 @@ class Salvage:
         for topic, kind, log_ns, _ in self._all(self.faults.append):
             self.topics[topic] = kind, self.topics.get(topic, (kind, 0))[1] + 1
             times.append(log_ns)
-        self.start_ns, self.end_ns = min(times, default=0), max(times, default=-1) + 1     # log time of the first, and just after the last
+        # log time of the first, and just after the last
+        self.start_ns, self.end_ns = min(times, default=0), max(times, default=-1) + 1
 
-    def messages(self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[Raw]:
+    def messages(self, topics: Collection[str], start_ns: int | None = None,
+                 stop_ns: int | None = None) -> Iterator[Raw]:
         """The messages on `topics` logged from `start_ns` to before `stop_ns`."""
-        return (m for m in self._all() if m[0] in topics and (start_ns is None or m[2] >= start_ns) and (stop_ns is None or m[2] < stop_ns))
+        return (m for m in self._all() if m[0] in topics and (start_ns is None or m[2] >= start_ns)
+                and (stop_ns is None or m[2] < stop_ns))
 
     def _all(self, fault: Fault = _ignore) -> Iterator[Raw]:
         for path in self._files:
@@ -62,7 +68,8 @@ class Salvage:
 
 
 def plain(raw: bytes) -> bytes:
-    """A message, unpacked where it was compressed by itself. Raises ZstdError where that makes no sense, or would be huge."""
+    """A message, unpacked where it was compressed by itself. Raises ZstdError where that makes no sense, or would be
+    huge."""
     if raw[:4] != ZSTD_MAGIC:
         return raw
     if zstandard.frame_content_size(raw) > SIZE_LIMIT:
@@ -84,7 +91,8 @@ def unpacked(path: Path, folder: Path, fault: Fault = _ignore) -> Path:
 
 
 def storage_files(path: Path) -> list[Path]:
-    """The storage files of a bag in a folder, or the one file it is; sorted by name and number, as a recording splits them."""
+    """The storage files of a bag in a folder, or the one file it is; sorted by name and number, as a recording splits
+    them."""
     names = ('*.mcap', '*.db3', '*.mcap.zstd', '*.db3.zstd')
     return sorted((p for pattern in names for p in path.glob(pattern)), key=_numbered) if path.is_dir() else [path]
 
@@ -114,7 +122,8 @@ def _mcap_records(path: Path, fault: Fault) -> Iterator:
         while True:
             try:
                 record = next(records, None)
-            except Exception:       # mcap raises anything from struct.error to its own on bytes that are no record: this is where it ends
+            except Exception:
+                # mcap raises anything from struct.error to its own on bytes that are no record: this is where it ends
                 fault(f'{path.name} ends early')
                 return
             if record is None:
@@ -138,12 +147,14 @@ def _parts(chunk: Chunk) -> list:
 def sqlite_messages(path: Path, fault: Fault = _ignore) -> Iterator[Raw]:
     """The messages of a sqlite3 storage file in the order in which they were written."""
     size = path.stat().st_size
-    with contextlib.closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True, check_same_thread=False)) as database:
+    with contextlib.closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True,
+                                            check_same_thread=False)) as database:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, STEPS))    # of a value: none is longer than the file
         database.set_progress_handler(_patience(size), STEPS)
         try:
             database.execute('PRAGMA writable_schema=ON')   # reads on where the file is shorter than it says
-            topics = {number: (name, kind) for number, name, kind in database.execute('SELECT id, name, type FROM topics')
+            topics = {number: (name, kind)
+                      for number, name, kind in database.execute('SELECT id, name, type FROM topics')
                       if isinstance(name, str) and isinstance(kind, str)}
         except DAMAGED:
             fault(f'{path.name} has no table of topics')
@@ -165,6 +176,7 @@ def sqlite_messages(path: Path, fault: Fault = _ignore) -> Iterator[Raw]:
 
 
 def _patience(size: int) -> Callable[[], bool]:
-    """What ends a query of a file of `size` bytes after more than any intact one takes: in a damaged one pages may follow one another without end."""
+    """What ends a query of a file of `size` bytes after more than any intact one takes: in a damaged one pages may
+    follow one another without end."""
     left = iter(range(1000 + size // 100))
     return lambda: next(left, None) is None

@@ -28,7 +28,8 @@ class BadPath(ValueError):
 
 
 def shape_to_path(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
-    """nav_msgs/Path, base to tip; each orientation turns +x into the tangent towards the tip, with rotation-minimising roll."""
+    """nav_msgs/Path, base to tip; each orientation turns +x into the tangent towards the tip, with rotation-minimising
+    roll."""
     head = header(new, stamp_ns, frame_id)
     poses = [new('geometry_msgs/msg/PoseStamped', header=head, pose=_pose(p, q, new))
              for p, q in zip(shape.points.tolist(), orientations(shape).tolist(), strict=True)]
@@ -36,7 +37,8 @@ def shape_to_path(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
 
 
 def shape_to_path_cdr(shape: Shape, stamp_ns: int, frame_id: str) -> bytes:
-    """What `shape_to_path` makes as ROS 2 serialises it (XCDR version 1, little endian; OMG DDS-XTypes 7.4), for a publisher that takes it as it is.
+    """What `shape_to_path` makes as ROS 2 serialises it (XCDR version 1, little endian; OMG DDS-XTypes 7.4), for a
+    publisher that takes it as it is.
 
     A hundred poses as Python objects cost several ms to make and to serialise, this a tenth of one.
     """
@@ -53,7 +55,8 @@ def shape_to_path_cdr(shape: Shape, stamp_ns: int, frame_id: str) -> bytes:
 
 def shape_to_tip(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
     """geometry_msgs/PointStamped of the last backbone point."""
-    return new('geometry_msgs/msg/PointStamped', header=header(new, stamp_ns, frame_id), point=_point(shape.tip.tolist(), new))
+    return new('geometry_msgs/msg/PointStamped', header=header(new, stamp_ns, frame_id),
+               point=_point(shape.tip.tolist(), new))
 
 
 def shape_to_tip_pose(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> Any:
@@ -64,19 +67,23 @@ def shape_to_tip_pose(shape: Shape, stamp_ns: int, frame_id: str, new: New) -> A
 
 
 def shape_to_cloud(shape: Shape, confidence: float, stamp_ns: int, frame_id: str, new: New) -> Any:
-    """sensor_msgs/PointCloud2 with the float32 fields x, y, z, s, sigma (m, in the worst direction), residual_a_px, residual_b_px, confidence; NaN: not known.
+    """sensor_msgs/PointCloud2 with the float32 fields x, y, z, s, sigma (m, in the worst direction), residual_a_px,
+    residual_b_px, confidence; NaN: not known.
 
     The confidence is the probability that the shape is right, the same in every point.
     """
-    rows = np.c_[shape.points, shape.s, _worst_sigma(shape.covariance), shape.residuals_px, np.full(len(shape.points), confidence)].astype(np.float32)
-    fields = [new('sensor_msgs/msg/PointField', name=name, offset=4 * k, datatype=_FLOAT32, count=1) for k, name in enumerate(CLOUD_FIELDS)]
-    return new('sensor_msgs/msg/PointCloud2', header=header(new, stamp_ns, frame_id), height=1, width=len(rows), fields=fields,
-               is_bigendian=sys.byteorder == 'big', point_step=rows.strides[0], row_step=rows.nbytes, data=rows.view(np.uint8),
-               is_dense=bool(np.isfinite(rows).all()))
+    rows = np.c_[shape.points, shape.s, _worst_sigma(shape.covariance), shape.residuals_px,
+                 np.full(len(shape.points), confidence)].astype(np.float32)
+    fields = [new('sensor_msgs/msg/PointField', name=name, offset=4 * k, datatype=_FLOAT32, count=1)
+              for k, name in enumerate(CLOUD_FIELDS)]
+    return new('sensor_msgs/msg/PointCloud2', header=header(new, stamp_ns, frame_id), height=1, width=len(rows),
+               fields=fields, is_bigendian=sys.byteorder == 'big', point_step=rows.strides[0], row_step=rows.nbytes,
+               data=rows.view(np.uint8), is_dense=bool(np.isfinite(rows).all()))
 
 
 def path_to_points(msg: Any) -> np.ndarray:
-    """(N, 3) positions of a nav_msgs/Path. Raises BadPath for fewer than 2 or more than MAX_POSES poses, and positions that are not finite."""
+    """(N, 3) positions of a nav_msgs/Path. Raises BadPath for fewer than 2 or more than MAX_POSES poses, and positions
+    that are not finite."""
     if not 2 <= len(msg.poses) <= MAX_POSES:
         raise BadPath(f'a backbone of {len(msg.poses)} poses: it needs 2 to {MAX_POSES}')
     positions = (pose.pose.position for pose in msg.poses)
@@ -96,9 +103,11 @@ def tangents(shape: Shape) -> np.ndarray:
 
 
 def orientations(shape: Shape) -> np.ndarray:
-    """(N, 4) quaternions x, y, z, w that turn +x into the tangents; from one to the next by the smallest rotation that carries tangent to tangent.
+    """(N, 4) quaternions x, y, z, w that turn +x into the tangents; from one to the next by the smallest rotation that
+    carries tangent to tangent.
 
-    That is parallel transport: the frame never turns about the backbone (Bishop 1975, There is more than one way to frame a curve).
+    That is parallel transport: the frame never turns about the backbone (Bishop 1975, There is more than one way to
+    frame a curve).
     """
     t = tangents(shape)
     turns = _smallest_rotations(np.vstack([[1.0, 0.0, 0.0], t[:-1]]), t)
@@ -111,7 +120,8 @@ def orientations(shape: Shape) -> np.ndarray:
 
 
 def _smallest_rotations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, 4) unit quaternions of the rotations by the smallest angle that turn the unit vectors a (N, 3) into b (N, 3)."""
+    """(N, 4) unit quaternions of the rotations by the smallest angle that turn the unit vectors a (N, 3) into b
+    (N, 3)."""
     w = 1.0 + np.sum(a * b, axis=1)
     axis = np.cross(a, b)
     opposite = w < 1e-12    # half a turn about any axis across will do
@@ -121,7 +131,8 @@ def _smallest_rotations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """(N, 4) Hamilton products p q of quaternions x, y, z, w; scipy's Rotation, written for more than this, takes six times as long."""
+    """(N, 4) Hamilton products p q of quaternions x, y, z, w; scipy's Rotation, written for more than this, takes six
+    times as long."""
     (px, py, pz, pw), (qx, qy, qz, qw) = p.T, q.T
     return np.stack([pw * qx + px * qw + py * qz - pz * qy, pw * qy - px * qz + py * qw + pz * qx,
                      pw * qz + px * qy - py * qx + pz * qw, pw * qw - px * qx - py * qy - pz * qz], axis=1)
@@ -143,7 +154,8 @@ def tip_covariance(shape: Shape) -> np.ndarray:
         return out
     t = tangents(shape)[-1]
     across = np.cross(np.eye(3), t)     # a change d of the direction is a rotation by t x d = across @ d
-    out[3:, 3:] = across @ (2 * (tip + shape.covariance[base]) / chord**2) @ across.T + ANY_ANGLE_VARIANCE * np.outer(t, t)
+    out[3:, 3:] = (across @ (2 * (tip + shape.covariance[base]) / chord**2) @ across.T
+                   + ANY_ANGLE_VARIANCE * np.outer(t, t))
     return out
 
 
@@ -159,4 +171,5 @@ def _point(p: list[float], new: New) -> Any:
 
 
 def _pose(p: list[float], q: list[float], new: New) -> Any:
-    return new('geometry_msgs/msg/Pose', position=_point(p, new), orientation=new('geometry_msgs/msg/Quaternion', x=q[0], y=q[1], z=q[2], w=q[3]))
+    return new('geometry_msgs/msg/Pose', position=_point(p, new),
+               orientation=new('geometry_msgs/msg/Quaternion', x=q[0], y=q[1], z=q[2], w=q[3]))

@@ -16,15 +16,21 @@ class Controller(Node):
         super().__init__('example_controller')
         self.robot = ROBOTS[self.declare_parameter('robot', 'two_tubes').value].robot
         self.patience = 2.1 / self.declare_parameter('rate', 15.0).value    # s: two pair times
-        self.max_sigma = self.declare_parameter('max_sigma', 0.001).value       # m: a tip that is less certain than this does not count
-        self.model_error = self.declare_parameter('model_error', 0.3).value     # by which the model misjudges a motion ...
-        self.drift = self.declare_parameter('drift', 0.00005).value             # ... and m, by which the tip may be pushed from pair to pair
+        # m: a tip that is less certain than this does not count
+        self.max_sigma = self.declare_parameter('max_sigma', 0.001).value
+        # by which the model misjudges a motion ...
+        self.model_error = self.declare_parameter('model_error', 0.3).value
+        # ... and m, by which the tip may be pushed from pair to pair
+        self.drift = self.declare_parameter('drift', 0.00005).value
         self.names = [joint.name for joint in self.robot.joints]
         self.speed = np.array([joint.speed for joint in self.robot.joints])
-        self.target, self.states, self.seen = None, deque(maxlen=1000), 0.0     # states: 1 s of them, if they come 1000 times a second
-        self.model, self.offset, self.P = np.zeros(3), np.zeros(3), np.eye(3)   # the model's tip, what the true one is beside it, its covariance
+        # states: 1 s of them, if they come 1000 times a second
+        self.target, self.states, self.seen = None, deque(maxlen=1000), 0.0
+        # the model's tip, what the true one is beside it, its covariance
+        self.model, self.offset, self.P = np.zeros(3), np.zeros(3), np.eye(3)
         self.command = self.create_publisher(JointState, 'joint_command', 1)
-        for kind, topic in ((JointState, 'joint_states'), (PointStamped, 'target'), (PoseWithCovarianceStamped, 'tip_pose')):
+        for kind, topic in ((JointState, 'joint_states'), (PointStamped, 'target'),
+                            (PoseWithCovarianceStamped, 'tip_pose')):
             self.create_subscription(kind, topic, getattr(self, f'on_{topic}'), 5)
 
     def on_joint_states(self, msg):
@@ -45,21 +51,25 @@ class Controller(Node):
 
     def on_tip_pose(self, msg):
         covariance = np.reshape(msg.pose.covariance, (6, 6))[:3, :3]
-        q = self.joints_at(time_of(msg))        # where the joints were when the images were taken: then a delay does no harm
+        q = self.joints_at(time_of(msg))   # where the joints were when the images were taken: then a delay does no harm
         late = q is None or self.states[-1][0] - time_of(msg) > self.patience
         if late or np.linalg.eigvalsh(covariance)[-1] > self.max_sigma**2:      # as if it had not come
             return
         self.seen = time_of(msg)
-        # a Kalman filter: what the images say of the tip counts by their covariance, against what the model says it did since the last pair
+        # a Kalman filter: what the images say of the tip counts by their covariance, against what the model says it did
+        # since the last pair
         tip, model = msg.pose.pose.position, self.robot.backbone(q)[-1]
         P = self.P + ((self.model_error * np.linalg.norm(model - self.model))**2 + self.drift**2) * np.eye(3)
         K = P @ np.linalg.inv(P + covariance)
-        self.model, self.offset, self.P = model, self.offset + K @ ([tip.x, tip.y, tip.z] - model - self.offset), P - K @ P
+        self.model, self.offset, self.P = (model, self.offset + K @ ([tip.x, tip.y, tip.z] - model - self.offset),
+                                           P - K @ P)
         if self.target is None:
             return
         error = self.target - model - self.offset
-        error *= min(0.35, 0.003 / max(np.linalg.norm(error), 1e-9))        # a third of it in one go, but no more than 3 mm
-        J = jacobian(self.robot, q) * self.speed                            # damped least squares; faster joints do more
+        # a third of it in one go, but no more than 3 mm
+        error *= min(0.35, 0.003 / max(np.linalg.norm(error), 1e-9))
+        # damped least squares; faster joints do more
+        J = jacobian(self.robot, q) * self.speed
         step = self.speed * (J.T @ np.linalg.solve(J @ J.T + 0.002**2 * np.eye(3), error))
         self.send(msg.header, (q + step).tolist())
 

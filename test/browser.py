@@ -9,8 +9,9 @@ from urllib.parse import unquote
 
 CHROMIUM = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None)
 # no network; time runs only while the page has nothing to do; WebGL in software, as there need not be a graphics card
-OPTIONS = ('--headless', '--no-sandbox', '--disable-dev-shm-usage', '--no-first-run', '--use-angle=swiftshader', '--enable-unsafe-swiftshader',
-           '--host-resolver-rules=MAP * ~NOTFOUND', '--enable-logging=stderr', '--window-size=1400,1500', '--virtual-time-budget=300000')
+OPTIONS = ('--headless', '--no-sandbox', '--disable-dev-shm-usage', '--no-first-run', '--use-angle=swiftshader',
+           '--enable-unsafe-swiftshader', '--host-resolver-rules=MAP * ~NOTFOUND', '--enable-logging=stderr',
+           '--window-size=1400,1500', '--virtual-time-budget=300000')
 CATCH = '''<script>
 window.problems = [];
 window.onerror = message => { problems.push(String(message)); };
@@ -29,7 +30,8 @@ top.document.documentElement.replaceChildren(out);
 
 
 def visit(page, script, folder, width=None):
-    """What `script` (the body of an async JavaScript function, which may `await until(() => condition)`) returns in `page`, and the page's errors.
+    """What `script` (the body of an async JavaScript function, which may `await until(() => condition)`) returns in
+    `page`, and the page's errors.
 
     The page is `width` px wide: in a frame, as Chromium's own window has at least 500 px.
     """
@@ -38,9 +40,11 @@ def visit(page, script, folder, width=None):
     body, end = rest.rsplit('</body>', 1)
     text = f'{head}<head>{CATCH}{body}{DRIVE % script}</body>{end}'
     if width is not None:
-        text = f'<body style="margin: 0"><iframe style="border: 0; width: {width}px; height: 900px" srcdoc="{html.escape(text)}"></iframe></body>'
+        text = (f'<body style="margin: 0"><iframe style="border: 0; width: {width}px; '
+                f'height: 900px" srcdoc="{html.escape(text)}"></iframe></body>')
     copy.write_text(text, encoding='utf-8')
-    done = subprocess.run([CHROMIUM, *OPTIONS, f'--user-data-dir={folder / "profile"}', '--dump-dom', copy.as_uri()], capture_output=True, text=True, timeout=240)
+    done = subprocess.run([CHROMIUM, *OPTIONS, f'--user-data-dir={folder / "profile"}', '--dump-dom', copy.as_uri()],
+                          capture_output=True, text=True, timeout=240)
     found = re.search(r'<pre id="answer">([^<]*)</pre>', done.stdout)
     assert found, f'no answer ({done.returncode}): {done.stdout[-500:]} {done.stderr[-3000:]}'
     answer, problems = json.loads(unquote(found[1]))

@@ -27,14 +27,17 @@ class Cluster:
 
     def __init__(self, folder: Path, **settings):
         self._folder, self._processes = folder, []
-        self._environment = {**os.environ, **dict.fromkeys(jobs.ONE_THREAD, '1'), **settings, 'PYTHONPATH': str(Path(fluoro_shape_ros.__file__).parents[1])}
+        self._environment = {**os.environ, **dict.fromkeys(jobs.ONE_THREAD, '1'), **settings,
+                             'PYTHONPATH': str(Path(fluoro_shape_ros.__file__).parents[1])}
         self.address = f'tcp://{HOST}:{free_port()}'
         self.scheduler = self._start('scheduler', '--port', self.address.rpartition(':')[2])
         self._client = pytest.importorskip('distributed').Client(self.address, timeout=PATIENCE_S, set_as_default=False)
 
     def workers(self, number: int, *options: str, code: str = '') -> list[subprocess.Popen]:
-        """So many workers of one thread, and no others, once the scheduler knows them; `code` comes before all else that they do."""
-        started = [self._start('worker', self.address, '--nthreads', '1', '--no-nanny', '--local-directory', str(self._folder), *options, code=code)
+        """So many workers of one thread, and no others, once the scheduler knows them; `code` comes before all else
+        that they do."""
+        started = [self._start('worker', self.address, '--nthreads', '1', '--no-nanny', '--local-directory',
+                               str(self._folder), *options, code=code)
                    for _ in range(number)]
         self._client.wait_for_workers(number, timeout=PATIENCE_S)
         return started
@@ -49,10 +52,11 @@ class Cluster:
             assert time.monotonic() < deadline
 
     def _start(self, what: str, *arguments: str, code: str = '') -> subprocess.Popen:
-        command = [sys.executable, '-c', f'{code}\nfrom distributed.cli.dask_{what} import main\nmain()', *arguments, '--host', HOST, '--no-dashboard',
-                   '--dashboard-address', f'{HOST}:0']
+        command = [sys.executable, '-c', f'{code}\nfrom distributed.cli.dask_{what} import main\nmain()', *arguments,
+                   '--host', HOST, '--no-dashboard', '--dashboard-address', f'{HOST}:0']
         with (self._folder / f'{len(self._processes)}.log').open('w') as log:
-            self._processes.append(subprocess.Popen(command, env=self._environment, stdout=log, stderr=log, cwd=self._folder))
+            self._processes.append(subprocess.Popen(command, env=self._environment, stdout=log, stderr=log,
+                                                    cwd=self._folder))
         return self._processes[-1]
 
     def end(self) -> None:

@@ -3,7 +3,8 @@
 import os
 import signal
 
-# as the package sets it, which tests that load numpy first would miss: with more threads BLAS rounds otherwise than other processes
+# as the package sets it, which tests that load numpy first would miss: with more threads BLAS rounds otherwise than
+# other processes
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import pytest
@@ -31,7 +32,8 @@ def this_machine_only():
 
 @pytest.fixture(scope='session', autouse=True)
 def signals_are_heard():
-    """By what the tests start, also where the tests themselves run in the background (Ctrl-C ignored) or under nohup (SIGHUP ignored)."""
+    """By what the tests start, also where the tests themselves run in the background (Ctrl-C ignored) or under nohup
+    (SIGHUP ignored)."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:

@@ -28,7 +28,8 @@ def projection(angle):
 
 def draw(P, size=SIZE, device=True, points=curve()):    # noqa: B008 (never changed)
     """(size, size) uint8: the shadow of a round wire along (N, 3) points, blurred, on a bright, even background."""
-    wire = xray.transmission(points, RADIUS, make_view('a', P, size, size), xray.Exposure(contrast=0.7)) if device else np.ones((size, size), np.float32)
+    wire = (xray.transmission(points, RADIUS, make_view('a', P, size, size), xray.Exposure(contrast=0.7))
+            if device else np.ones((size, size), np.float32))
     return np.rint(cv2.GaussianBlur(180 * wire, (5, 5), 0)).astype(np.uint8)
 
 

@@ -1,7 +1,8 @@
-"""Fuzz what reads bytes from elsewhere: `python test/fuzz.py TARGET --runs N`; atheris mutates messages, bags and DICOM files that are in order.
+"""Fuzz what reads bytes from elsewhere: `python test/fuzz.py TARGET --runs N`; atheris mutates messages, bags and DICOM
+files that are in order.
 
-Whatever the bytes, the reader either reads them or refuses them by its own exception. Any other one ends the run with a traceback, exit
-code 77, and the bytes in a file crash-*; `python test/fuzz.py TARGET FILE` tries that again.
+Whatever the bytes, the reader either reads them or refuses them by its own exception. Any other one ends the run with a
+traceback, exit code 77, and the bytes in a file crash-*; `python test/fuzz.py TARGET FILE` tries that again.
 """
 
 import argparse
@@ -14,9 +15,12 @@ from typing import ClassVar
 
 import atheris
 
-with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.files.dicom', 'fluoro_shape_ros.files.dicom_header',
-                                         'fluoro_shape_ros.files.dicom_frames', 'fluoro_shape_ros.files.dicom_geometry', 'fluoro_shape_ros.files.dicom_pixels'],
-                                exclude=['pydicom._dicom_dict', 'pydicom._private_dict', 'pydicom._uid_dict', 'pydicom.sr']):
+with atheris.instrument_imports(include=['msg_adapters', 'rosbags', 'pydicom', 'fluoro_shape_ros.files.dicom',
+                                         'fluoro_shape_ros.files.dicom_header',
+                                         'fluoro_shape_ros.files.dicom_frames', 'fluoro_shape_ros.files.dicom_geometry',
+                                         'fluoro_shape_ros.files.dicom_pixels'],
+                                exclude=['pydicom._dicom_dict', 'pydicom._private_dict', 'pydicom._uid_dict',
+                                         'pydicom.sr']):
     import numpy as np
     from fuzz_seeds import COMPRESSED, IMAGE, INFO, PATH, TYPES, new, seeds
     from rosbags.highlevel import anyreader
@@ -39,7 +43,7 @@ def message(data: bytes, kind: str):
     """The message in serialized bytes, or None where the middleware would not have delivered it."""
     try:
         return TYPES.deserialize_cdr(data, kind)
-    except Exception:   # noqa: BLE001 - not ours: rosbags raises anything on damaged bytes, and BagReader answers for it
+    except Exception:  # noqa: BLE001 - not ours: rosbags raises anything on damaged bytes, and BagReader answers for it
         return None
 
 
@@ -115,19 +119,23 @@ def dicom(data: bytes) -> None:
         assert all(np.isfinite(c.P).all() for c in run.calibrations)
         assert run.times_ns is None or run.times_ns.shape == (len(run.calibrations),)
         for frame in pictures(run):
-            assert frame.shape == (run.calibrations[0].height, run.calibrations[0].width) and frame.dtype in (np.uint8, np.uint16)
+            assert (frame.shape == (run.calibrations[0].height, run.calibrations[0].width)
+                    and frame.dtype in (np.uint8, np.uint16))
     except BadDicom as error:
         assert str(error).isprintable() and len(str(error)) < 600 and 'ecret' not in str(error)
 
 
 TARGETS = {f.__name__: f for f in (image, compressed_image, camera_info, path, bag_mcap, bag_db3, dicom)}
-ONE_OF = [name for name in TARGETS for _ in range(1 if name in ('bag_mcap', 'bag_db3', 'dicom') else 8)]     # files take ten times as long
-SCRATCH = tempfile.TemporaryDirectory(dir='/dev/shm' if Path('/dev/shm').is_dir() else None)    # of the file that is tried
+# files take ten times as long
+ONE_OF = [name for name in TARGETS for _ in range(1 if name in ('bag_mcap', 'bag_db3', 'dicom') else 8)]
+# of the file that is tried
+SCRATCH = tempfile.TemporaryDirectory(dir='/dev/shm' if Path('/dev/shm').is_dir() else None)
 
 
 def beginning(target: str) -> list[bytes]:
     """What mutations begin with."""
-    return [bytes([ONE_OF.index(name)]) + data for name in TARGETS for data in seeds(name)] if target == 'everything' else seeds(target)
+    return ([bytes([ONE_OF.index(name)]) + data for name in TARGETS for data in seeds(name)]
+            if target == 'everything' else seeds(target))
 
 
 def everything(data: bytes) -> None:
@@ -137,7 +145,8 @@ def everything(data: bytes) -> None:
 
 
 class Remembered(Typestore):
-    """A store of the types of a bag that shares the code made for another bag whose definitions are the same: to make that is 90 % of the time."""
+    """A store of the types of a bag that shares the code made for another bag whose definitions are the same: to make
+    that is 90 % of the time."""
 
     known: ClassVar[dict[str, Typestore]] = {}
 
@@ -151,14 +160,17 @@ class Remembered(Typestore):
 
 
 def hurry() -> None:
-    """Have rosbags parse and compile a definition of types once, not for every bag that has it; start no process for every DICOM file."""
+    """Have rosbags parse and compile a definition of types once, not for every bag that has it; start no process for
+    every DICOM file."""
     anyreader.get_types_from_msg = lru_cache(1000)(anyreader.get_types_from_msg)
     anyreader.get_typestore = lambda _: Remembered(empty)
-    dicom_pixels.decoded = lambda run: iter(())     # C++, to which these mutations say little, and which may end the process
+    # C++, to which these mutations say little, and which may end the process
+    dicom_pixels.decoded = lambda run: iter(())
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog='fuzz.py', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(prog='fuzz.py', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('target', choices=[*TARGETS, 'everything'])
     parser.add_argument('file', nargs='?', help='try the bytes of this file once, instead of fuzzing')
     parser.add_argument('--runs', type=int, default=1_000_000, help='how many executions (default: %(default)s)')
@@ -173,7 +185,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as corpus:
         for k, data in enumerate(beginning(args.target)):
             (Path(corpus) / str(k)).write_bytes(data)
-        atheris.Setup([sys.argv[0], corpus, f'-runs={args.runs}', f'-seed={args.seed}', '-max_len=65536', '-rss_limit_mb=1024', '-timeout=60', '-verbosity=1'],
+        atheris.Setup([sys.argv[0], corpus, f'-runs={args.runs}', f'-seed={args.seed}', '-max_len=65536',
+                       '-rss_limit_mb=1024', '-timeout=60', '-verbosity=1'],
                       target)
         atheris.Fuzz()      # does not return
 

@@ -1,4 +1,5 @@
-"""A page that a server feeds, in a real headless Chromium: what test_web.py stands on. It is driven by the DevTools protocol through a pipe, in real time."""
+"""A page that a server feeds, in a real headless Chromium: what test_web.py stands on. It is driven by the DevTools
+protocol through a pipe, in real time."""
 
 import base64
 import json
@@ -10,7 +11,8 @@ from contextlib import suppress
 
 from browser import CHROMIUM
 
-OPTIONS = ('--headless', '--no-sandbox', '--disable-dev-shm-usage', '--no-first-run', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--remote-debugging-pipe')
+OPTIONS = ('--headless', '--no-sandbox', '--disable-dev-shm-usage', '--no-first-run', '--use-angle=swiftshader',
+           '--enable-unsafe-swiftshader', '--remote-debugging-pipe')
 
 
 class LivePage:
@@ -32,8 +34,10 @@ class LivePage:
             os.dup2(a, 3)
             os.dup2(b, 4)
 
-        self.process = subprocess.Popen([CHROMIUM, *OPTIONS, f'--window-size={self._size[0]},{self._size[1]}', f'--user-data-dir={self._profile}', 'about:blank'],
-                                        pass_fds=(3, 4, commands, answers), preexec_fn=on_3_and_4, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self.process = subprocess.Popen([CHROMIUM, *OPTIONS, f'--window-size={self._size[0]},{self._size[1]}',
+                                         f'--user-data-dir={self._profile}', 'about:blank'],
+                                        pass_fds=(3, 4, commands, answers), preexec_fn=on_3_and_4,
+                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         os.close(commands)
         os.close(answers)
         target = self.call('Target.createTarget', url='about:blank')['targetId']
@@ -57,7 +61,8 @@ class LivePage:
         """The result of a command."""
         self._count += 1
         session = {} if method.startswith('Target.') else {'sessionId': self._session}
-        os.write(self._commands, json.dumps(dict(id=self._count, method=method, params=parameters, **session)).encode() + b'\0')
+        os.write(self._commands,
+                 json.dumps(dict(id=self._count, method=method, params=parameters, **session)).encode() + b'\0')
         deadline = time.monotonic() + limit
         while True:
             message = self._next(deadline)

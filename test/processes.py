@@ -19,6 +19,7 @@ def reconstructing_for(pid):
 def gone(pid):
     """Whether a process has ended, with all its threads; that nobody has asked for its exit code yet does not count."""
     try:
-        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] == 'Z' and os.listdir(f'/proc/{pid}/task') == [str(pid)]
+        return (Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] == 'Z'
+                and os.listdir(f'/proc/{pid}/task') == [str(pid)])
     except (FileNotFoundError, ProcessLookupError):
         return True

@@ -31,7 +31,8 @@ def record(path, pairs, storage='mcap', *, stamps=None, infos=True, spoil=lambda
                 if compressed:
                     message = bag.new(kind, header=message.header, format='png', data=cv2.imencode('.png', pixels)[1])
                 if infos:
-                    bag.write(f'/plane_{p}/camera_info', calibration_to_camera_info(calibration, stamp + skew, f'plane_{p}_optical', bag.new), log)
+                    bag.write(f'/plane_{p}/camera_info',
+                              calibration_to_camera_info(calibration, stamp + skew, f'plane_{p}_optical', bag.new), log)
                 bag.write(f'/plane_{p}/image_raw{suffix}', message, log)
     return path
 
@@ -43,7 +44,8 @@ def read(path):
 
 def outcomes(path):
     """Outcome of every pair by its stamp, from the diagnostics."""
-    return {stamp_ns(m): {v.key: v.value for v in m.status[0].values}['last outcome'] for _, m in read(path)['/diagnostics']}
+    return {stamp_ns(m): {v.key: v.value for v in m.status[0].values}['last outcome']
+            for _, m in read(path)['/diagnostics']}
 
 
 def main(*arguments):

@@ -27,7 +27,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
 
 STEP_NS = 66_000_000
-DOMAIN = int(os.environ.get('TEST_DOMAIN', 1 + 2 * (os.getpid() % 50)))    # two runs on one machine rarely meet; TEST_DOMAIN: never
+# two runs on one machine rarely meet; TEST_DOMAIN: never
+DOMAIN = int(os.environ.get('TEST_DOMAIN', 1 + 2 * (os.getpid() % 50)))
 OTHER = DOMAIN + 1                  # for a second node beside the first
 BASE = 'base_position:=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])     # so that the tip is no guess
 RADIUS = f'robot_radius:={drawing.RADIUS}'
@@ -73,7 +74,8 @@ def bytes_of(data):
 
 def image_msg(pixels, **fields):
     """A mono8 Image; `fields` override what makes it right."""
-    values = dict(height=pixels.shape[0], width=pixels.shape[1], encoding='mono8', step=pixels.shape[1], data=bytes_of(pixels.tobytes()))
+    values = dict(height=pixels.shape[0], width=pixels.shape[1], encoding='mono8', step=pixels.shape[1],
+                  data=bytes_of(pixels.tobytes()))
     return Image(**{**values, **fields})
 
 
@@ -83,8 +85,8 @@ def png_msg(pixels):
 
 def info_msg(P, size=SIZE, **fields):
     """A CameraInfo with full P; `fields` override."""
-    values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5, k=intrinsics(size).ravel().tolist(),
-                  r=np.eye(3).ravel().tolist(), p=P.ravel().tolist())
+    values = dict(height=size, width=size, distortion_model='plumb_bob', d=[0.0] * 5,
+                  k=intrinsics(size).ravel().tolist(), r=np.eye(3).ravel().tolist(), p=P.ravel().tolist())
     return CameraInfo(**{**values, **fields})
 
 
@@ -100,8 +102,8 @@ class NodeProcess:
         start = ['-m', 'fluoro_shape_ros.node'] if code is None else ['-c', code]
         arguments = ['--ros-args', *arguments, *(word for p in parameters for word in ('-p', p))]
         self._log = log
-        self.process = subprocess.Popen([sys.executable, *start, *arguments], stdout=log.open('w'), stderr=subprocess.STDOUT,
-                                        env={**os.environ, 'ROS_DOMAIN_ID': str(domain)})
+        self.process = subprocess.Popen([sys.executable, *start, *arguments], stdout=log.open('w'),
+                                        stderr=subprocess.STDOUT, env={**os.environ, 'ROS_DOMAIN_ID': str(domain)})
 
     def __enter__(self):
         return self
@@ -132,7 +134,8 @@ class Client:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         qos = QoSProfile(depth=10, reliability=reliability, durability=durability)
-        kind, topic, self._message = (CompressedImage, 'image_raw/compressed', png_msg) if compressed else (Image, 'image_raw', image_msg)
+        kind, topic, self._message = ((CompressedImage, 'image_raw/compressed', png_msg)
+                                      if compressed else (Image, 'image_raw', image_msg))
         self.images = [self.node.create_publisher(kind, f'plane_{p}/{topic}', qos) for p in 'ab']
         self.infos = [self.node.create_publisher(CameraInfo, f'plane_{p}/camera_info', qos) for p in 'ab']
         self.prediction = self.node.create_publisher(Path, 'predicted_backbone', 1)
@@ -160,7 +163,8 @@ class Client:
     def listening(self, topics):
         """Subscribed to `topics` (name to type) for a while: topic to the messages heard, by stamp."""
         heard = {topic: {} for topic in topics}
-        subscriptions = [self.node.create_subscription(kind, topic, self._keep(heard[topic]), 10) for topic, kind in topics.items()]
+        subscriptions = [self.node.create_subscription(kind, topic, self._keep(heard[topic]), 10)
+                         for topic, kind in topics.items()]
         try:
             assert self.until(lambda: all(self.node.count_publishers(topic) for topic in topics))
             yield heard
@@ -203,7 +207,8 @@ class Client:
         return (self.paths[stamp_ns], self.tips[stamp_ns]) if heard else None
 
     def insist(self, condition, pair=GOOD, every=0.3, **options):
-        """Whether `condition()` came true while a pair was sent again and again: discovery takes its time, and best-effort may lose it."""
+        """Whether `condition()` came true while a pair was sent again and again: discovery takes its time, and
+        best-effort may lose it."""
         return any(self.send_pixels(pair, **options) and self.until(condition, every) for _ in range(60))
 
     def good(self):
@@ -220,7 +225,8 @@ class Client:
     def value(self, name, key):
         """The newest value of a key in the diagnostics of e.g. 'pairing', heard from now on."""
         del self.statuses[:]
-        found = lambda: [v.value for s in self.statuses if s.name.endswith(name) for v in s.values if v.key == key]  # noqa: E731
+        found = lambda: [v.value for s in self.statuses if s.name.endswith(name)    # noqa: E731
+                         for v in s.values if v.key == key]
         assert self.until(found)
         return found()[-1]
 
@@ -245,16 +251,19 @@ class Client:
     def set(self, name, value=None, type_=None):
         """The result of setting a parameter."""
         msg: ParameterMsg = Parameter(name, type_, value).to_parameter_msg()
-        return self.call(SetParameters, '/fluoro_shape/set_parameters', SetParameters.Request(parameters=[msg])).results[0]
+        return self.call(SetParameters, '/fluoro_shape/set_parameters',
+                         SetParameters.Request(parameters=[msg])).results[0]
 
 
 @contextmanager
 def answered(tmp_path_factory, *parameters):
-    """A NodeProcess and a Client that it has answered; when the block is left, the node must be alive and have told of no bug.
+    """A NodeProcess and a Client that it has answered; when the block is left, the node must be alive and have told of
+    no bug.
 
     It takes its time: on a busy machine some pair would be out of time.
     """
-    with NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', 'time_budget:=0', *parameters) as node, Client() as client:
+    with (NodeProcess(tmp_path_factory.mktemp('node') / 'log.txt', 'time_budget:=0', *parameters) as node,
+          Client() as client):
         assert client.connected() and client.insist(lambda: client.paths), node.log
         yield node, client
         assert node.process.poll() is None, node.log

@@ -1,8 +1,10 @@
-"""Truth under stress: `python test/soak.py --seconds 1800` sends the node pairs at a rate, with random faults, and watches what comes out.
+"""Truth under stress: `python test/soak.py --seconds 1800` sends the node pairs at a rate, with random faults, and
+watches what comes out.
 
-It fails (exit code 1) where the node ends or reports a bug, a result comes after that of a later pair or belongs to none that could have one,
-a result is wrong without saying so (mean error > 1 mm or tip > 2 mm), memory grows, or the number of threads or files does. Seeded: the same
-faults come in the same order. Now and then (--kills) the process that reconstructs is killed.
+It fails (exit code 1) where the node ends or reports a bug, a result comes after that of a later pair or belongs to
+none that could have one, a result is wrong without saying so (mean error > 1 mm or tip > 2 mm), memory grows, or the
+number of threads or files does. Seeded: the same faults come in the same order. Now and then (--kills) the process that
+reconstructs is killed.
 """
 
 import argparse
@@ -25,7 +27,8 @@ SIZE = 512
 PROFILE = Path(__file__).parents[1] / 'resource/fastdds_large_images.xml'
 WARM_UP_S = 20.0            # caches fill, buffers grow to their sizes
 MEAN_M, TIP_M = 0.001, 0.002
-FAULTS = ('lost plane', 'bad encoding', 'bad step', 'short data', 'blank', 'bad camera', 'no camera', 'skew', 'duplicate', 'zero stamp', 'out of order',
+FAULTS = ('lost plane', 'bad encoding', 'bad step', 'short data', 'blank', 'bad camera', 'no camera', 'skew',
+          'duplicate', 'zero stamp', 'out of order',
           'jump back', 'jump forward', 'reset', 'pause', 'parameters', 'huge header')
 
 
@@ -48,7 +51,8 @@ class Soak:
         self.views = [projection(0), projection(90)]
         self.good, self.blank = ([picture(P, device) for P in self.views] for device in (True, False))
         self.tree, self.tip = cKDTree(ros.curve()), ros.curve()[-1]
-        self.counts, self.failures, self.right = Counter(), [], {}       # right: stamp of a pair that may be answered -> its number
+        # right: stamp of a pair that may be answered -> its number
+        self.counts, self.failures, self.right = Counter(), [], {}
         self.judged, self.last = 0, -1      # answers; number of the pair answered last
 
     def infos(self):
@@ -56,7 +60,8 @@ class Soak:
 
     def pair(self, fault=''):
         """Send a pair, spoilt by `fault`."""
-        images, infos, options = [image_msg(pixels) for pixels in (self.blank if fault == 'blank' else self.good)], self.infos(), {}
+        images, infos, options = ([image_msg(pixels) for pixels in (self.blank if fault == 'blank' else self.good)],
+                                  self.infos(), {})
         spoilt = images[int(self.rng.integers(2))]
         if fault == 'bad encoding':
             spoilt.encoding = 'yuv422'
@@ -101,7 +106,8 @@ class Soak:
             self.call('reset', lambda: client.trigger('reset'))
         elif kind == 'pause':
             for on in (False, True):
-                self.call('enable', lambda on=on: client.call(SetBool, '/fluoro_shape/enable', SetBool.Request(data=on)))
+                self.call('enable', lambda on=on: client.call(SetBool, '/fluoro_shape/enable',
+                                                              SetBool.Request(data=on)))
         elif kind == 'parameters':
             self.call('set', lambda: client.set('backbone_spacing', float(self.rng.uniform(0.001, 0.003))))
         else:
@@ -137,7 +143,8 @@ class Soak:
 
     def watch(self):
         """Whether the node lives and reports no bug; its diagnostics go no farther."""
-        bugs = [s.message for s in self.client.statuses if 'internal_error' in s.message and 'reconstruction restarted: it died of SIGKILL' not in s.message]
+        bugs = [s.message for s in self.client.statuses
+                if 'internal_error' in s.message and 'reconstruction restarted: it died of SIGKILL' not in s.message]
         if bugs:
             self.failures.append(f'a bug: {bugs[0]}')
         if self.node.process.poll() is not None:
@@ -147,9 +154,12 @@ class Soak:
 
 
 def resources(pid):
-    """Resident memory in MB of a node and of the process that reconstructs for it; threads and open files of the node."""
-    field = lambda name, pid: int(Path(f'/proc/{pid}/status').read_text().split(f'\n{name}:')[1].split()[0])  # noqa: E731
-    return sum(field('VmRSS', p) for p in (pid, *reconstructing_for(pid))) / 1024, field('Threads', pid), len(os.listdir(f'/proc/{pid}/fd'))
+    """Resident memory in MB of a node and of the process that reconstructs for it; threads and open files of the
+    node."""
+    field = lambda name, pid: (    # noqa: E731
+        int(Path(f'/proc/{pid}/status').read_text().split(f'\n{name}:')[1].split()[0]))
+    return (sum(field('VmRSS', p) for p in (pid, *reconstructing_for(pid))) / 1024, field('Threads', pid),
+            len(os.listdir(f'/proc/{pid}/fd')))
 
 
 def soak(node, client, seconds, rate, share, seed, growth_mb, kills):
@@ -168,11 +178,13 @@ def soak(node, client, seconds, rate, share, seed, growth_mb, kills):
         else:
             run.pair()
         sent += 1
-        client.until(lambda: False, start + sent / rate - time.monotonic())     # no longer than that: pairs must not come in bursts
+        # no longer than that: pairs must not come in bursts
+        client.until(lambda: False, start + sent / rate - time.monotonic())
         run.judge()
         if before is None and time.monotonic() > start + warm:
             before = resources(node.process.pid)
-        if run.counts['killed'] < kills and time.monotonic() > start + warm + (run.counts['killed'] + 1) * (seconds - warm) / (kills + 1):
+        if (run.counts['killed'] < kills
+                and time.monotonic() > start + warm + (run.counts['killed'] + 1) * (seconds - warm) / (kills + 1)):
             run.kill()
     client.now_ns += 200 * 10**9
     good = lambda: run.pair() and client.until(lambda: client.now_ns in client.paths, 2.0)      # noqa: E731
@@ -187,23 +199,32 @@ def soak(node, client, seconds, rate, share, seed, growth_mb, kills):
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog='soak.py', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(prog='soak.py', description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seconds', type=float, default=1800.0, help='default: %(default)s')
     parser.add_argument('--rate', type=float, default=30.0, help='pairs a second (default: %(default)s)')
-    parser.add_argument('--faults', type=float, default=0.2, help='share of faults among the pairs (default: %(default)s)')
+    parser.add_argument('--faults', type=float, default=0.2,
+                        help='share of faults among the pairs (default: %(default)s)')
     parser.add_argument('--seed', type=int, default=1, help='default: %(default)s')
-    parser.add_argument('--kills', type=int, default=20, help='of the process that reconstructs, after the warm-up (default: %(default)s)')
-    parser.add_argument('--growth', type=float, default=5.0, help='MB by which memory may grow after the warm-up (default: %(default)s)')
+    parser.add_argument('--kills', type=int, default=20,
+                        help='of the process that reconstructs, after the warm-up (default: %(default)s)')
+    parser.add_argument('--growth', type=float, default=5.0,
+                        help='MB by which memory may grow after the warm-up (default: %(default)s)')
     args = parser.parse_args()
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))       # as shipped, three pairs of four are lost on the way
-    with tempfile.TemporaryDirectory() as folder, NodeProcess(Path(folder) / 'log.txt', BASE, ros.RADIUS) as node, Client() as client:
-        run, (before, after) = soak(node, client, args.seconds, args.rate, args.faults, args.seed, args.growth, args.kills)
+    # as shipped, three pairs of four are lost on the way
+    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))
+    with (tempfile.TemporaryDirectory() as folder, NodeProcess(Path(folder) / 'log.txt', BASE, ros.RADIUS) as node,
+          Client() as client):
+        run, (before, after) = soak(node, client, args.seconds, args.rate, args.faults, args.seed, args.growth,
+                                    args.kills)
         if node.end() != 0 or 'Traceback' in node.log:
             run.failures.append(f'the node ended with {node.process.returncode}: {node.log[-2000:]}')
     faults = {kind: run.counts[kind] for kind in FAULTS}
-    print(f'{run.counts["pairs"]} pairs in {args.seconds:g} s, {sum(faults.values())} faults ({", ".join(f"{n} {kind}" for kind, n in faults.items())})')
-    print(f'{run.counts["killed"]} kills; {run.judged} answers; memory {before[0]:.1f} to {after[0]:.1f} MB, threads {before[1]} to {after[1]}, files {before[2]} to {after[2]}')
+    print(f'{run.counts["pairs"]} pairs in {args.seconds:g} s, '
+          f'{sum(faults.values())} faults ({", ".join(f"{n} {kind}" for kind, n in faults.items())})')
+    print(f'{run.counts["killed"]} kills; {run.judged} answers; memory {before[0]:.1f} to {after[0]:.1f} MB, '
+          f'threads {before[1]} to {after[1]}, files {before[2]} to {after[2]}')
     for failure, n in Counter(run.failures).most_common():
         print(f'FAILED {n} times: {failure}')
     print('failed' if run.failures else 'passed')

@@ -12,8 +12,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / 'docs' / 'architecture.md').read_text(encoding='utf-8')
 PACKAGES = 'fluoro_shape_ros', 'msg_adapters'
-ROS = {'rclpy', 'tf2_ros', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs', 'std_srvs',
-       'visualization_msgs'}
+ROS = {'rclpy', 'tf2_ros', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces',
+       'sensor_msgs', 'std_msgs', 'std_srvs', 'visualization_msgs'}
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ def named(cell: str) -> tuple[str, ...]:
     return tuple(re.findall('`([^`]+)`', cell))
 
 
-ROOMS = {name: Room(named(files), frozenset(known.split()), ros == 'yes') for name, files, known, ros, _ in cells('directions')}
+ROOMS = {name: Room(named(files), frozenset(known.split()), ros == 'yes')
+         for name, files, known, ros, _ in cells('directions')}
 EXCEPTIONS = {(named(file)[0], other) for file, others, _ in cells('exceptions') for other in named(others)}
 
 
@@ -47,7 +48,8 @@ def short(path: str) -> str:
 
 def sources() -> dict[str, str]:
     """The text of every module by its file, as the page names it."""
-    return {short(path.relative_to(ROOT).as_posix()): path.read_text(encoding='utf-8') for package in PACKAGES for path in (ROOT / package).rglob('*.py')}
+    return {short(path.relative_to(ROOT).as_posix()): path.read_text(encoding='utf-8') for package in PACKAGES
+            for path in (ROOT / package).rglob('*.py')}
 
 
 def imported(file: str, source: str) -> set[str]:
@@ -58,21 +60,24 @@ def imported(file: str, source: str) -> set[str]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = '.'.join([*(package[:len(package) - node.level + 1] if node.level else []), *filter(None, [node.module])])
+            base = '.'.join([*(package[:len(package) - node.level + 1] if node.level else []),
+                             *filter(None, [node.module])])
             found |= {base, *(f'{base}.{alias.name}' for alias in node.names)}
     return found
 
 
 def rooms_of(file: str, rooms: dict[str, Room]) -> list[str]:
     """The rooms that name a file, else those with a pattern that it fits."""
-    return [name for name, room in rooms.items() if file in room.files] or [name for name, room in rooms.items() if any(fnmatchcase(file, p) for p in room.files)]
+    return ([name for name, room in rooms.items() if file in room.files]
+            or [name for name, room in rooms.items() if any(fnmatchcase(file, p) for p in room.files)])
 
 
 def broken(modules: dict[str, str], rooms: dict[str, Room]) -> set[tuple[str, str]]:
     """File and what it imports, where its room may not know that one's; a package's __init__ may know nothing."""
     found = set()
     for file, source in modules.items():
-        known = set() if file.endswith('__init__.py') else {r for name in rooms_of(file, rooms) for r in (name, *rooms[name].known)}
+        known = set() if file.endswith('__init__.py') else {r for name in rooms_of(file, rooms)
+                                                            for r in (name, *rooms[name].known)}
         others = {short(f'{name.replace(".", "/")}.py') for name in imported(file, source)} & modules.keys()
         found |= {(file, other) for other in others if not known.intersection(rooms_of(other, rooms))}
     return found
@@ -81,7 +86,8 @@ def broken(modules: dict[str, str], rooms: dict[str, Room]) -> set[tuple[str, st
 def test_every_module_is_in_one_room_and_no_row_is_out_of_date():
     files = [file for file in sources() if not file.endswith('__init__.py')]
     assert {file: found for file in files if len(found := rooms_of(file, ROOMS)) != 1} == {}
-    assert [pattern for room in ROOMS.values() for pattern in room.files if not any(fnmatchcase(file, pattern) for file in files)] == []
+    assert [pattern for room in ROOMS.values() for pattern in room.files
+            if not any(fnmatchcase(file, pattern) for file in files)] == []
     assert {name for room in ROOMS.values() for name in room.known} <= ROOMS.keys()
 
 
@@ -96,12 +102,15 @@ def test_the_directions_have_no_circle():
 
 
 def test_only_the_ends_import_ros():
-    found = {file for file, source in sources().items() if {name.partition('.')[0] for name in imported(file, source)} & ROS}
+    found = {file for file, source in sources().items()
+             if {name.partition('.')[0] for name in imported(file, source)} & ROS}
     assert [file for file in sorted(found) if not any(ROOMS[name].ros for name in rooms_of(file, ROOMS))] == []
-    assert {name for file in found for name in rooms_of(file, ROOMS)} == {name for name, room in ROOMS.items() if room.ros}
+    assert ({name for file in found for name in rooms_of(file, ROOMS)}
+            == {name for name, room in ROOMS.items() if room.ros})
 
 
-HOUSE = {'ground': Room(('data.py',), frozenset(), False), 'adapters': Room(('msg_adapters/*',), frozenset(['ground']), False),
+HOUSE = {'ground': Room(('data.py',), frozenset(), False),
+         'adapters': Room(('msg_adapters/*',), frozenset(['ground']), False),
          'fit': Room(('method/fit/*',), frozenset(['ground']), False)}
 
 

@@ -26,12 +26,15 @@ def test_replace_keeps_the_rest():
 
 
 @pytest.mark.parametrize('name, value, reason', [
-    ('robot_radius', -1.0, 'must lie in'), ('robot_radius', float('nan'), 'finite'), ('robot_radius', 'thin', 'number'), ('robot_radius', True, 'number'),
-    ('polarity', 'grey', 'must be one of dark, bright, auto'), ('image_kind', 'mri', 'must be one of xray, silhouette'), ('image_kind', 1, 'needs a str'),
+    ('robot_radius', -1.0, 'must lie in'), ('robot_radius', float('nan'), 'finite'), ('robot_radius', 'thin', 'number'),
+    ('robot_radius', True, 'number'), ('polarity', 'grey', 'must be one of dark, bright, auto'),
+    ('image_kind', 'mri', 'must be one of xray, silhouette'), ('image_kind', 1, 'needs a str'),
     ('min_confidence', 1.01, 'must lie in'), ('rectified', 1, 'needs a bool'), ('mask_frames', 0, 'must lie in'),
-    ('mask_frames', 2.5, 'needs a int'), ('base_position', [1.0, 2.0], 'needs 0 or 3 numbers'), ('expected_length', [0.2, 0.1], 'min < max'),
-    ('base_position', 5, 'needs a list of numbers, got 5'), ('expected_length', 'long', 'needs a list of numbers'), ('time_budget', -0.1, 'must lie in'),
-    ('expected_length', [0.1, float('inf')], 'finite'), ('device', '/none.yaml', '/none.yaml: no such file'), ('device', 7, 'needs a str')])
+    ('mask_frames', 2.5, 'needs a int'), ('base_position', [1.0, 2.0], 'needs 0 or 3 numbers'),
+    ('expected_length', [0.2, 0.1], 'min < max'), ('base_position', 5, 'needs a list of numbers, got 5'),
+    ('expected_length', 'long', 'needs a list of numbers'), ('time_budget', -0.1, 'must lie in'),
+    ('expected_length', [0.1, float('inf')], 'finite'), ('device', '/none.yaml', '/none.yaml: no such file'),
+    ('device', 7, 'needs a str')])
 def test_what_cannot_work_is_refused(name, value, reason):
     with pytest.raises(ConfigError, match=f'{name}.*{reason}'):
         Config.from_values(**{name: value})
@@ -64,7 +67,8 @@ def test_the_radius_is_that_of_the_device_where_one_is_given(name):
     assert config.replace(device='').radius == 0.003 and config.replace(device='').described is None
 
 
-@pytest.mark.parametrize('lengths, radius', [((0.02, 0.04, REST), 2e-3), ((0.06, 0.01, REST), 3e-3), ((0.001, 0.001, REST), 1e-3), ((0.01, 0.03), 2e-3)])
+@pytest.mark.parametrize('lengths, radius', [((0.02, 0.04, REST), 2e-3), ((0.06, 0.01, REST), 3e-3),
+                                             ((0.001, 0.001, REST), 1e-3), ((0.01, 0.03), 2e-3)])
 def test_the_radius_is_the_one_that_most_images_show(lengths, radius):
     """The median over 0.1 m from the tip, of segments of 3, 2 and 1 mm."""
     device = Device(tuple(Segment(length, r, 'metal') for length, r in zip(lengths, (3e-3, 2e-3, 1e-3))))

@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 
 from fluoro_shape_ros import device
-from fluoro_shape_ros.device import REST, Device, DeviceError, Piece, Ring, Segment, attenuation, load_device, presets, water_attenuation
+from fluoro_shape_ros.device import (
+    REST,
+    Device,
+    DeviceError,
+    Piece,
+    Ring,
+    Segment,
+    attenuation,
+    load_device,
+    presets,
+    water_attenuation,
+)
 from fluoro_shape_ros.resources import resource_path
 
 EXAMPLE = device.__doc__.split('\n\n')[1]
@@ -40,7 +51,8 @@ def band(**changes):
 
 
 def test_the_docstrings_example(read):
-    expected = Device((Segment(0.060, 0.0007, 'metal', 0.0005), Segment(REST, 0.0010, 'metal', 0.0008)), (Ring(0.002, 0.001, 0.00075, 'platinum'),))
+    expected = Device((Segment(0.060, 0.0007, 'metal', 0.0005), Segment(REST, 0.0010, 'metal', 0.0008)),
+                      (Ring(0.002, 0.001, 0.00075, 'platinum'),))
     assert read(EXAMPLE) == expected
     assert expected.radius == 0.0007 and expected.widest == 0.0010 and expected.length == REST
 
@@ -56,7 +68,8 @@ disks:
   - {at: 0, length: 0.001, radius: 0.003, attenuation: 40.5, every: 0.01}
   - {at: 0.3, length: 0.1, radius: 0.0009, material: platinum}
 ''')
-    segments = (Segment(0.05, 0.001, 250.0), Segment(0.2, 0.0008, 'polymer', 0.0004), Segment(0.1, 0.0008, 'metal', 0.0004))
+    segments = (Segment(0.05, 0.001, 250.0), Segment(0.2, 0.0008, 'polymer', 0.0004),
+                Segment(0.1, 0.0008, 'metal', 0.0004))
     assert found == Device(segments, (), (Ring(0.0, 0.001, 0.003, 40.5, 0.01), Ring(0.3, 0.1, 0.0009, 'platinum')))
     assert found.length == pytest.approx(0.35) and found.radius == 0.001 and found.widest == 0.003
 
@@ -69,11 +82,13 @@ def test_encodings(read, encoding):
 # ---- parts
 
 
-CANNULA = Device((Segment(0.060, 0.0007, 'metal', 0.0005), Segment(REST, 0.0010, 'metal', 0.0008)), (Ring(0.002, 0.001, 0.00075, 'platinum'),))
+CANNULA = Device((Segment(0.060, 0.0007, 'metal', 0.0005), Segment(REST, 0.0010, 'metal', 0.0008)),
+                 (Ring(0.002, 0.001, 0.00075, 'platinum'),))
 
 
 @pytest.mark.parametrize('length, expected', [
-    (0.1, [Piece(0, 0.06, 0.0007, 0.0005, 'metal'), Piece(0.06, 0.1, 0.0010, 0.0008, 'metal'), Piece(0.002, 0.003, 0.00075, 0.0007, 'platinum')]),
+    (0.1, [Piece(0, 0.06, 0.0007, 0.0005, 'metal'), Piece(0.06, 0.1, 0.0010, 0.0008, 'metal'),
+           Piece(0.002, 0.003, 0.00075, 0.0007, 'platinum')]),
     (0.06, [Piece(0, 0.06, 0.0007, 0.0005, 'metal'), Piece(0.002, 0.003, 0.00075, 0.0007, 'platinum')]),
     (0.0025, [Piece(0, 0.0025, 0.0007, 0.0005, 'metal'), Piece(0.002, 0.0025, 0.00075, 0.0007, 'platinum')]),
     (0.001, [Piece(0, 0.001, 0.0007, 0.0005, 'metal')]),
@@ -112,7 +127,8 @@ def test_pieces_fill_the_length_without_gaps():
     rng = np.random.default_rng(5)
     for _ in range(50):
         lengths = rng.uniform(0.001, 0.05, rng.integers(1, 8))
-        spans = Device(tuple(Segment(float(x), 0.001, 'metal') for x in lengths)).pieces(whole := float(rng.uniform(0.001, 0.3)))
+        spans = Device(tuple(Segment(float(x), 0.001, 'metal')
+                             for x in lengths)).pieces(whole := float(rng.uniform(0.001, 0.3)))
         assert spans[0].start == 0 and spans[-1].stop == whole
         assert [p.start for p in spans[1:]] == [p.stop for p in spans[:-1]] and all(p.stop > p.start for p in spans)
 
@@ -143,8 +159,10 @@ WRONG = {
     'disks false': (ROD + 'disks: false\n', 'disks: must be a list'),
     'ring a list': (ROD + 'disks: [[]]\n', r'disks\[0\]: must be a map such as'),
     'unknown at the top': (ROD + 'segmets: []\n', 'unknown: segmets; there are segments, bands, disks'),
-    'unknown in a segment': (segment(every=0.1), r'segments\[0\]: unknown: every; there are length, radius, lumen, material, attenuation'),
-    'unknown in a band': (band(lumen=0.0002), r'bands\[0\]: unknown: lumen; there are at, length, radius, every, material, attenuation'),
+    'unknown in a segment': (segment(every=0.1), r'segments\[0\]: unknown: every; there are length, radius, lumen, '
+                                                 r'material, attenuation'),
+    'unknown in a band': (band(lumen=0.0002), r'bands\[0\]: unknown: lumen; there are at, length, radius, every, '
+                                              r'material, attenuation'),
     'unknown number': (segment() + '2: 3\n', 'unknown: 2; there are'),
     'many unknown': (ROD + ''.join(f'k{i}: 1\n' for i in range(20)), 'unknown: k0, k1, k10; there are'),
     'no length': (segment(length=None), r'segments\[0\]: length is missing'),
@@ -152,8 +170,10 @@ WRONG = {
     'no material': (segment(material=None), r'segments\[0\]: needs either material or attenuation'),
     'two materials': (segment(attenuation=100), r'segments\[0\]: needs either material or attenuation'),
     'no at': (band(at=None, radius=None), r'bands\[0\]: at, radius is missing'),
-    'unknown material': (segment(material='wood'), r'segments\[0\]: no material is called wood: there are metal, platinum, polymer, or attenuation in 1/m'),
-    'material a number': (segment(material=250), r'segments\[0\]: material must be a name, got 250; a number is called attenuation'),
+    'unknown material': (segment(material='wood'), r'segments\[0\]: no material is called wood: there are metal, '
+                                                   r'platinum, polymer, or attenuation in 1/m'),
+    'material a number': (segment(material=250), r'segments\[0\]: material must be a name, got 250; '
+                                                 r'a number is called attenuation'),
     'material true': (segment(material='true'), r'segments\[0\]: material must be a name, got True'),
     'material none': (segment(material='~'), r'segments\[0\]: material must be a name, got None'),
     'material a list': (segment(material='[metal]'), r'segments\[0\]: material must be a name, got a list'),
@@ -172,35 +192,49 @@ WRONG = {
     'negative length': (segment(length=-1), r'segments\[0\]: length must lie in .* got -1'),
     'no length at all': (segment(length=0), r'segments\[0\]: length must lie in .* got 0'),
     'too long': (segment(length=60), r'segments\[0\]: length must lie in \[1e-05, 10\] m.* got 60'),
-    'rest is not the last': (segment() + '  - {length: 0.1, radius: 0.001, material: metal}\n', r'segments\[0\]: length must .* `rest` in the last segment, got rest'),
-    'lumen as wide': (segment(lumen=0.001), r'segments\[0\]: lumen, a radius in m, must lie in \[0, radius\), got 0.001'),
+    'rest is not the last': (segment() + '  - {length: 0.1, radius: 0.001, material: metal}\n',
+                             r'segments\[0\]: length must .* `rest` in the last segment, got rest'),
+    'lumen as wide': (segment(lumen=0.001), r'segments\[0\]: lumen, a radius in m, '
+                                            r'must lie in \[0, radius\), got 0.001'),
     'negative lumen': (segment(lumen=-0.0001), r'segments\[0\]: lumen, .* got -0.0001'),
-    'the second one': (segment(length=0.1) + '  - {length: rest, radius: 7, material: metal}\n', r'segments\[1\]: radius must lie'),
-    'no attenuation': (segment(material=None, attenuation=0), r'segments\[0\]: attenuation must lie in \(0, 1e6\) 1/m, got 0'),
+    'the second one': (segment(length=0.1) + '  - {length: rest, radius: 7, material: metal}\n',
+                       r'segments\[1\]: radius must lie'),
+    'no attenuation': (segment(material=None, attenuation=0),
+                       r'segments\[0\]: attenuation must lie in \(0, 1e6\) 1/m, got 0'),
     'negative attenuation': (band(material=None, attenuation=-5), r'bands\[0\]: attenuation must lie in .* got -5'),
-    'attenuation nan': (segment(material=None, attenuation='.nan'), r'segments\[0\]: attenuation must be a number, got nan'),
-    'attenuation a name': (segment(material=None, attenuation='metal'), r'segments\[0\]: attenuation must be a number, got metal'),
-    'too much attenuation': (segment(material=None, attenuation='1.0e+7'), r'segments\[0\]: attenuation must lie in .* got 1e\+07'),
+    'attenuation nan': (segment(material=None, attenuation='.nan'),
+                        r'segments\[0\]: attenuation must be a number, got nan'),
+    'attenuation a name': (segment(material=None, attenuation='metal'),
+                           r'segments\[0\]: attenuation must be a number, got metal'),
+    'too much attenuation': (segment(material=None, attenuation='1.0e+7'),
+                             r'segments\[0\]: attenuation must lie in .* got 1e\+07'),
     'band before the tip': (band(at=-0.001), r'bands\[0\]: at must lie in \[0, 10\] m, got -0.001'),
     'band of no length': (band(length=0), r'bands\[0\]: length must lie in .* got 0'),
     'band without end': (band(length='rest'), r'bands\[0\]: length must be a number, got rest'),
     'band too wide': (band(radius=0.5), r'bands\[0\]: radius must lie in .* got 0.5'),
-    'band inside': (band(radius=0.001), r'bands\[0\]: radius 0.001 m does not stand out from the segment that it sits on, of 0.001 m'),
+    'band inside': (band(radius=0.001), r'bands\[0\]: radius 0.001 m does not stand out from the segment that it sits '
+                                        r'on, of 0.001 m'),
     'band meets itself': (band(every=0.001), r'bands\[0\]: every must lie in \[length, 10\] m, got 0.001'),
     'every is negative': (band(every=-1), r'bands\[0\]: every must lie in .* got -1'),
-    'beyond the device': (band(at=0.3).replace('rest', '0.3'), r'bands\[0\]: begins at 0.3 m from the tip, but the device is 0.3 m long'),
-    'narrow on the second': (segment(length=0.02) + WIDER + 'bands:\n  - {at: 0.019, length: 0.002, radius: 0.0015, material: metal}\n',
+    'beyond the device': (band(at=0.3).replace('rest', '0.3'),
+                          r'bands\[0\]: begins at 0.3 m from the tip, but the device is 0.3 m long'),
+    'narrow on the second': (segment(length=0.02) + WIDER
+                             + 'bands:\n  - {at: 0.019, length: 0.002, radius: 0.0015, material: metal}\n',
                              r'bands\[0\]: radius 0.0015 m does not stand out .* of 0.002 m'),
-    'narrow when repeated': (segment(length=0.02) + WIDER + 'disks:\n  - {at: 0, length: 0.001, radius: 0.0015, every: 0.005, material: metal}\n',
+    'narrow when repeated': (segment(length=0.02) + WIDER
+                             + 'disks:\n  - {at: 0, length: 0.001, radius: 0.0015, every: 0.005, material: metal}\n',
                              r'disks\[0\]: radius 0.0015 m does not stand out .* of 0.002 m'),
-    'rings without number': (band(length='1e-5', every='1e-5'), r'bands and disks: those that repeat \(every\) come more than once in 0.0001 m'),
+    'rings without number': (band(length='1e-5', every='1e-5'),
+                             r'bands and disks: those that repeat \(every\) come more than once in 0.0001 m'),
     'rings without length': (band(length='1e-9', every='1e-9'), r'bands\[0\]: length must lie in'),
     'not yaml': ('segments: [', 'not YAML: while parsing a flow node, .* line 1'),
     'a tab': ('segments:\n\t- 1\n', 'not YAML: while scanning for the next token, found character .* line 2'),
     'two documents': (f'{ROD}---\n{ROD}', 'not YAML: expected a single document .* line 3'),
     'twice': (ROD + 'bands: []\n' + 'bands: []\n', 'not YAML: bands is there twice, line 1'),
-    'a key twice': ('segments:\n  - {length: rest, radius: 0.001, radius: 0.002, material: metal}\n', 'not YAML: radius is there twice, line 2'),
-    'a tag of python': ('segments: !!python/object/apply:os.system ["exit"]\n', 'not YAML: could not determine a constructor for the tag .*python'),
+    'a key twice': ('segments:\n  - {length: rest, radius: 0.001, radius: 0.002, material: metal}\n',
+                    'not YAML: radius is there twice, line 2'),
+    'a tag of python': ('segments: !!python/object/apply:os.system ["exit"]\n',
+                        'not YAML: could not determine a constructor for the tag .*python'),
     'no such date': ('segments: 2024-13-45\n', 'not YAML: month must be in 1..12'),
     'a wrong tag': ('segments: !!int many\n', 'not YAML: invalid literal'),
     'a wrong bool': ('segments: !!bool many\n', 'not YAML: '),
@@ -237,14 +271,17 @@ def test_wrong_files_are_refused_in_one_line(read, tmp_path, text, message):
 
 
 def test_aliases_of_aliases_take_no_time_and_no_room(read):
-    """Nine of the one before, twelve times: 9^12 entries for whoever writes them all out, and as many keys where they are merged."""
+    """Nine of the one before, twelve times: 9^12 entries for whoever writes them all out, and as many keys where they
+    are merged."""
     lists = 'bands: &a0 [x]\n' + ''.join(f'k{i}: &a{i + 1} [{", ".join([f"*a{i}"] * 9)}]\n' for i in range(12))
     with pytest.raises(DeviceError, match='unknown: k0, k1, k10'):
         read(lists)
     with pytest.raises(DeviceError, match=r'segments\[0\]: radius must be a number, got a list'):
         read(segment(radius='&r [*r, *r]'))
-    merged = 'segments:\n  - &m0 {a: 1, b: 1}\n' + ''.join(f'  - &m{i + 1} {{<<: [{", ".join([f"*m{i}"] * 9)}]}}\n' for i in range(12))
-    with pytest.raises(DeviceError, match=r'more than 100 keys|segments\[0\]'):       # PyYAML has learnt to drop what is merged twice
+    merged = 'segments:\n  - &m0 {a: 1, b: 1}\n' + ''.join(f'  - &m{i + 1} {{<<: [{", ".join([f"*m{i}"] * 9)}]}}\n'
+                                                           for i in range(12))
+    # PyYAML has learnt to drop what is merged twice
+    with pytest.raises(DeviceError, match=r'more than 100 keys|segments\[0\]'):
         read(merged)
 
 
@@ -264,8 +301,10 @@ def test_no_garbled_file_raises_anything_else(read):
 
 
 @pytest.mark.parametrize('wrong', [
-    dict(segments=()), dict(segments=(Segment(0.1, float('nan'), 'metal'),)), dict(segments=(Segment(float('nan'), 0.001, 'metal'),)),
-    dict(segments=(Segment(REST, 0.001, 'metal', float('nan')),)), dict(segments=(Segment(REST, 0.001, True),)), dict(segments=(Segment(REST, 0.001, float('nan')),)),
+    dict(segments=()), dict(segments=(Segment(0.1, float('nan'), 'metal'),)),
+    dict(segments=(Segment(float('nan'), 0.001, 'metal'),)),
+    dict(segments=(Segment(REST, 0.001, 'metal', float('nan')),)), dict(segments=(Segment(REST, 0.001, True),)),
+    dict(segments=(Segment(REST, 0.001, float('nan')),)),
     dict(segments=(Segment(REST, 0.001, 'metal'),), bands=(Ring(float('nan'), 0.001, 0.002, 'metal'),)),
     dict(segments=(Segment(REST, 0.001, 'metal'),), disks=(Ring(0.0, 0.001, 0.002, 'metal', float('nan')),)),
 ])
@@ -286,7 +325,8 @@ def test_paths(tmp_path, monkeypatch):
     assert load_device('mine') == load_device('./mine') == rod
 
 
-@pytest.mark.parametrize('name', ['', 'nothing', '/no/such/file', '~', '~nobody-of-this-name/x', '.', '..', 'rod/', '../resource/rod', 'x' * 5000, 'a\0b', 'a\nb'])
+@pytest.mark.parametrize('name', ['', 'nothing', '/no/such/file', '~', '~nobody-of-this-name/x', '.', '..', 'rod/',
+                                  '../resource/rod', 'x' * 5000, 'a\0b', 'a\nb'])
 def test_what_is_not_there_is_refused_with_what_is(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DeviceError, match='no such file, nor a device .* there are braided, cannula, ') as refused:
@@ -317,7 +357,8 @@ def test_presets_are_the_files():
     assert presets() == sorted(p.name[7:-5] for p in folder.glob('device_*.yaml')) and len(presets()) >= 8
     for name in presets():
         path = folder / f'device_{name}.yaml'
-        assert load_device(name) == load_device(f'device_{name}') == load_device(f'device_{name}.yaml') == load_device(path)
+        assert (load_device(name) == load_device(f'device_{name}') == load_device(f'device_{name}.yaml')
+                == load_device(path))
         assert path.read_text().startswith('# A')
 
 
@@ -335,10 +376,11 @@ def test_presets_are_what_they_say():
     assert d['rod'].segments == (Segment(REST, 0.00055, 'metal'),) and d['rod'].widest == 0.00055
     assert [(2 * s.radius, 2 * s.lumen) for s in d['tube'].segments] == [(0.0020, 0.0015)]
     walls = [s.radius - s.lumen for s in (*d['cannula'].segments, *d['cannula3'].segments)]
-    assert walls == pytest.approx([0.0002, 0.0004, 0.00015, 0.00035, 0.00055])      # each tube's, and of those inside it
+    assert walls == pytest.approx([0.0002, 0.0004, 0.00015, 0.00035, 0.00055])  # each tube's, and of those inside it
     assert d['cannula'].segments[0].length == 0.060
     assert [len(d[name].bands) for name in ('ep', 'braided', 'tendon')] == [3, 1, 0]
-    assert 2 * d['ep'].widest == pytest.approx(7 / 3 * 1e-3, rel=0.03) and d['ep'].segments[0].material == 'platinum' and d['ep'].segments[0].length == 0.004
+    assert (2 * d['ep'].widest == pytest.approx(7 / 3 * 1e-3, rel=0.03) and d['ep'].segments[0].material == 'platinum'
+            and d['ep'].segments[0].length == 0.004)
     assert 2 * d['braided'].disks[0].radius == pytest.approx(6 / 3 * 1e-3, rel=0.03)
     assert (d['braided'].disks[0].every, d['braided'].disks[0].at > 0.006) == (0.0012, True)
     assert 2 * d['coil'].radius == 0.0009 and d['coil'].segments[0].length == 0.030

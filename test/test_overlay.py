@@ -52,8 +52,10 @@ def test_the_backbone_is_drawn_where_the_image_as_received_shows_it(views):
 
 
 def test_a_ring_shows_where_the_tip_is():
-    ring = np.hypot(*(np.mgrid[:SIZE, :SIZE] - 405.5 + np.array([0, 50])[:, None, None])).round() == o.RING     # rows, columns
-    red = [o.overlay(GREY, 0, result, VIEWS)[ring].astype(int) @ (-1, -1, 2) for result in (found(straight(sigma=1e-5)), rejected())]
+    # rows, columns
+    ring = np.hypot(*(np.mgrid[:SIZE, :SIZE] - 405.5 + np.array([0, 50])[:, None, None])).round() == o.RING
+    red = [o.overlay(GREY, 0, result, VIEWS)[ring].astype(int) @ (-1, -1, 2)
+           for result in (found(straight(sigma=1e-5)), rejected())]
     assert np.median(red[0]) > 60 and red[1].max() == 0
 
 
@@ -73,10 +75,12 @@ def test_dashes_are_as_long_as_their_gaps():
 def test_the_ellipse_of_the_tip():
     """Isotropic sigma of 1 mm is 1 px here; 95 % of a Gaussian in the plane lie within sqrt(-2 ln 0.05) sigma."""
     ellipse = o.tip_ellipse(VIEWS[0], straight(0.001))
-    assert np.allclose(np.linalg.norm(ellipse - (355.5, 405.5), axis=1), np.sqrt(-2 * np.log(0.05)), atol=0.05)     # seen at 10 degrees
+    # seen at 10 degrees
+    assert np.allclose(np.linalg.norm(ellipse - (355.5, 405.5), axis=1), np.sqrt(-2 * np.log(0.05)), atol=0.05)
     assert np.array_equal(ellipse[0], ellipse[-1])
     deep = replace(straight(), covariance=np.tile(np.diag([1e-6, 4e-6, 1e-12]), (51, 1, 1)))
-    assert np.allclose(np.ptp(o.tip_ellipse(VIEWS[0], deep), axis=0), 2 * np.sqrt(-2 * np.log(0.05)) * np.array([1, 2]), rtol=1e-3)
+    assert np.allclose(np.ptp(o.tip_ellipse(VIEWS[0], deep), axis=0), 2 * np.sqrt(-2 * np.log(0.05)) * np.array([1, 2]),
+                       rtol=1e-3)
     assert o.tip_ellipse(VIEWS[0], straight(np.nan)) is None
 
 
@@ -114,7 +118,8 @@ def test_a_line_across_the_image():
     assert len(o.across(np.array([0.0, 1.0, -200.0]), 100, 50)) == 0
 
 
-@pytest.mark.parametrize('dtype, scale, offset', [(np.uint8, 1, 0), (np.uint16, 257, 0), (np.uint16, 4, 3000), (np.float32, 1e-3, -0.05)])
+@pytest.mark.parametrize('dtype, scale, offset',
+                         [(np.uint8, 1, 0), (np.uint16, 257, 0), (np.uint16, 4, 3000), (np.float32, 1e-3, -0.05)])
 def test_any_range_of_grey_gives_the_same_contrast(dtype, scale, offset):
     image = np.full((256, 256), 120, np.uint8)
     image[100:140, 30:220] = 90
@@ -131,7 +136,7 @@ def test_neither_noise_nor_the_unexposed_border_sets_the_grey_levels():
     round_field = cv2.circle(np.zeros_like(image), (256, 256), 220, 1, -1)
     low, high = o.grey_levels(image * round_field)
     assert low > 75 and high < 200
-    assert np.abs(o.stretched(np.full((64, 64), 7, np.float32)) - 127.5).max() < 1     # nothing to see is grey, not black
+    assert np.abs(o.stretched(np.full((64, 64), 7, np.float32)) - 127.5).max() < 1  # nothing to see is grey, not black
 
 
 def test_words():
@@ -144,11 +149,14 @@ def test_words():
 
 def test_words_say_how_sure_it_is():
     assert o.words(found(confidence=0.998)) == ['ok, confidence 0.998, 50.0 mm long, tip +-1.00 mm']
-    assert o.words(found(straight(np.nan), confidence=0.998, warnings=('tip_ambiguous',))) == ['ok, confidence 0.998, 50.0 mm long', 'tip ambiguous']
-    assert o.words(rejected(confidence=0.0)) == ['no result', 'no correspondence: only 3 px', 'the best curve has confidence 0.000']
+    assert (o.words(found(straight(np.nan), confidence=0.998, warnings=('tip_ambiguous',)))
+            == ['ok, confidence 0.998, 50.0 mm long', 'tip ambiguous'])
+    assert o.words(rejected(confidence=0.0)) == ['no result', 'no correspondence: only 3 px',
+                                                 'the best curve has confidence 0.000']
     low = Reconstruction(Outcome.LOW_CONFIDENCE, 'it ends at a wire', confidence=0.4126)
     assert o.words(low) == ['no result', 'confidence too low: it ends at a wire', 'the best curve has confidence 0.413']
-    assert strip(o.overlay(GREY, 0, low), o.WORDS)[0].max() > strip(o.overlay(GREY, 0, rejected()), o.WORDS)[0].max()      # a line more
+    # a line more
+    assert strip(o.overlay(GREY, 0, low), o.WORDS)[0].max() > strip(o.overlay(GREY, 0, rejected()), o.WORDS)[0].max()
 
 
 def strip(picture, colour):
@@ -178,7 +186,8 @@ def test_the_inset_keeps_clear_of_the_device():
     side = round(o.INSET * SIZE)
     rows, columns = strip(picture, o.TIP)
     corner = rows.max() - rows.min(), (columns < side).sum()
-    assert corner[0] > side - 5 and corner[1] > 3 * side    # its frame is the tip's colour, at the left: the device is at the right
+    # its frame is the tip's colour, at the left: the device is at the right
+    assert corner[0] > side - 5 and corner[1] > 3 * side
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (3, 300), (300, 5), (40, 40)])

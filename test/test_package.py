@@ -33,7 +33,8 @@ def read_setup() -> dict:
 
 
 METADATA = read_setup()
-EXECUTABLES = {name: target.removesuffix(':main') for name, target in (line.split(' = ') for line in METADATA['entry_points']['console_scripts'])}
+EXECUTABLES = {name: target.removesuffix(':main')
+               for name, target in (line.split(' = ') for line in METADATA['entry_points']['console_scripts'])}
 
 
 @pytest.fixture(scope='module')
@@ -52,8 +53,8 @@ def test_package_xml_and_setup_py_agree(manifest):
 
 
 def test_every_python_dependency_is_a_rosdep_dependency(manifest):
-    keys = {'numpy': 'python3-numpy', 'pyyaml': 'python3-yaml', 'scipy': 'python3-scipy', 'opencv-python-headless': 'python3-opencv', 'scikit-image': 'python3-skimage',
-            'tqdm': 'python3-tqdm'}
+    keys = {'numpy': 'python3-numpy', 'pyyaml': 'python3-yaml', 'scipy': 'python3-scipy',
+            'opencv-python-headless': 'python3-opencv', 'scikit-image': 'python3-skimage', 'tqdm': 'python3-tqdm'}
     required = {requirement.split('>')[0] for requirement in METADATA['install_requires']}
     assert required == set(keys)
     assert {keys[name] for name in required} <= {e.text for e in manifest.findall('exec_depend')}
@@ -67,13 +68,15 @@ def test_data_files_exist_and_ros2_run_finds_every_executable():
     stubs = {Path(name).name: (ROOT / name).read_text() for name in files['lib/fluoro_shape_ros']}
     assert set(stubs) == set(EXECUTABLES)
     for name, text in stubs.items():
-        assert f' -m {EXECUTABLES[name]} ' in text and (ROOT / 'resource/bin' / name).stat().st_mode & 0o111 == 0o111, name
+        assert (f' -m {EXECUTABLES[name]} ' in text
+                and (ROOT / 'resource/bin' / name).stat().st_mode & 0o111 == 0o111), name
     assert f'resource/{PROFILE}' in files['share/fluoro_shape_ros']
 
 
 def test_the_version_moves_with_the_changelog(manifest):
     headings = re.findall(r'^(.+)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8'), re.MULTILINE)
-    releases = [re.fullmatch(r'(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)', heading) for heading in headings[headings[0] == 'Forthcoming':]]
+    releases = [re.fullmatch(r'(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)', heading)
+                for heading in headings[headings[0] == 'Forthcoming':]]
     assert all(releases), headings
     newest = releases[0][1] if releases else '0.1.0'        # that of the first release, before there is one
     assert METADATA['version'] == manifest.findtext('version') == fluoro_shape_ros.__version__ == newest
@@ -86,7 +89,8 @@ def test_the_page_of_parameters_lists_every_one_as_it_is():
 
 
 def test_the_file_of_defaults_is_true():
-    assert resources.resource_path('defaults.yaml').read_text() == defaults_file(), 'python test/test_package.py writes it'
+    assert resources.resource_path('defaults.yaml').read_text() == defaults_file(), ('python test/test_package.py '
+                                                                                     'writes it')
 
 
 def test_troubleshooting_names_every_rejection():
@@ -99,17 +103,20 @@ def parameter_table() -> str:
     rows = ['| parameter | default | unit | range | what it is |', '|---|---|---|---|---|']
     for f in fields():
         m = f.metadata
-        rows.append(f'| `{f.name}` | `{_default(f)}` | {m["unit"]} | {_range(f).removeprefix("one of: ")} | {m["description"]} |')
+        rows.append(f'| `{f.name}` | `{_default(f)}` | {m["unit"]} | {_range(f).removeprefix("one of: ")} | '
+                    f'{m["description"]} |')
     return '\n'.join(rows)
 
 
 def defaults_file() -> str:
     """resource/defaults.yaml."""
-    lines = ['# Every parameter of fluoro_shape_node with its default: copy, change, and give it with `--ros-args --params-file`.',
+    lines = ['# Every parameter of fluoro_shape_node with its default: '
+             'copy, change, and give it with `--ros-args --params-file`.',
              '# Made from config.py. `/**` means: whatever the namespace of the node is.', '/**:', '  ros__parameters:']
     for f in fields():
         notes = ', '.join(filter(None, (f.metadata['unit'], _range(f))))
-        lines += [f'    # {f.metadata["description"]}' + (f' ({notes})' if notes else ''), f'    {f.name}: {_default(f)}']
+        lines += [f'    # {f.metadata["description"]}' + (f' ({notes})' if notes else ''),
+                  f'    {f.name}: {_default(f)}']
     return '\n'.join(lines) + '\n'
 
 
@@ -128,7 +135,8 @@ def _range(f) -> str:
 def test_the_profile_is_found_and_has_room_for_megapixel_images():
     ns = {'d': 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'}
     profiles = ElementTree.parse(resources.resource_path(PROFILE)).getroot().find('d:profiles', ns)
-    transports = {t.findtext('d:transport_id', None, ns): t for t in profiles.findall('d:transport_descriptors/d:transport_descriptor', ns)}
+    transports = {t.findtext('d:transport_id', None, ns): t
+                  for t in profiles.findall('d:transport_descriptors/d:transport_descriptor', ns)}
     rtps = profiles.find('d:participant[@is_default_profile="true"]/d:rtps', ns)
     used = [t.text for t in rtps.findall('d:userTransports/d:transport_id', ns)]
     assert sorted(transports[name].findtext('d:type', None, ns) for name in used) == ['SHM', 'UDPv4']
@@ -147,7 +155,8 @@ def test_a_missing_resource_is_named():
 
 WITHOUT_ROS = '''
 import sys
-BLOCKED = {'rclpy', 'sensor_msgs', 'nav_msgs', 'geometry_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs', 'visualization_msgs', 'builtin_interfaces', 'rcl_interfaces'}
+BLOCKED = {'rclpy', 'sensor_msgs', 'nav_msgs', 'geometry_msgs', 'std_msgs', 'std_srvs',
+           'diagnostic_msgs', 'visualization_msgs', 'builtin_interfaces', 'rcl_interfaces'}
 class Blocker:
     def find_spec(self, name, path=None, target=None):
         if name.split('.')[0] in BLOCKED:
@@ -160,18 +169,22 @@ def python(code, *arguments):
     return subprocess.run([sys.executable, '-c', code, *arguments], capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.parametrize('module', ['fluoro_shape_ros.method.pipeline', 'fluoro_shape_ros.sim.scenes', 'msg_adapters.images', 'msg_adapters.shapes', 'msg_adapters.bags',
+@pytest.mark.parametrize('module', ['fluoro_shape_ros.method.pipeline', 'fluoro_shape_ros.sim.scenes',
+                                    'msg_adapters.images', 'msg_adapters.shapes', 'msg_adapters.bags',
                                     *sorted(EXECUTABLES.values())])
 def test_imports_without_ros(module):
     done = python(f'{WITHOUT_ROS}\nimport importlib, sys\nimportlib.import_module(sys.argv[1])', module)
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize('name', ['fluoro_shape_node', 'fluoro_shape_sim', 'fluoro_shape_demo', 'fluoro_shape_servo_demo'])
+@pytest.mark.parametrize('name', ['fluoro_shape_node', 'fluoro_shape_sim', 'fluoro_shape_demo',
+                                  'fluoro_shape_servo_demo'])
 def test_what_needs_ros_says_so_in_one_line(name):
-    done = python(f'{WITHOUT_ROS}\nimport importlib, sys\nsys.exit(importlib.import_module(sys.argv[1]).main([]))', EXECUTABLES[name])
+    done = python(f'{WITHOUT_ROS}\nimport importlib, sys\nsys.exit(importlib.import_module(sys.argv[1]).main([]))',
+                  EXECUTABLES[name])
     assert done.returncode == 1
-    assert done.stderr.count('\n') == 1 and done.stderr.startswith(name) and 'rclpy' in done.stderr and 'fluoro_shape_ros[ros]' in done.stderr, done.stderr
+    assert (done.stderr.count('\n') == 1 and done.stderr.startswith(name) and 'rclpy' in done.stderr
+            and 'fluoro_shape_ros[ros]' in done.stderr), done.stderr
 
 
 # ---- executables
@@ -189,5 +202,6 @@ def test_help_and_nonsense(name):
 if __name__ == '__main__':
     before, rest = PARAMETERS.read_text(encoding='utf-8').split('<!-- parameters -->\n')
     after = rest.split('<!-- /parameters -->')[1]
-    PARAMETERS.write_text(f'{before}<!-- parameters -->\n{parameter_table()}\n<!-- /parameters -->{after}', encoding='utf-8')
+    PARAMETERS.write_text(f'{before}<!-- parameters -->\n{parameter_table()}\n<!-- /parameters -->{after}',
+                          encoding='utf-8')
     (ROOT / 'resource' / 'defaults.yaml').write_text(defaults_file())

@@ -4,18 +4,22 @@ The backbone is the true curve X(s), s in [0, L], moved by a small smooth displa
 
     d(s) = sum_j B_j(s) (a_j n1(s) + b_j n2(s)),      T(s) the tangent, n1, n2 across it,
 
-B_j cubic B-splines with knots KNOT_SPACING apart, while its two ends slide along the axis by c0 (base) and c1 (tip). Displacement along the
-axis between the ends changes no image, so these 2 n + 2 parameters theta are all that there is to know of a curve this smooth.
+B_j cubic B-splines with knots KNOT_SPACING apart, while its two ends slide along the axis by c0 (base) and c1 (tip).
+Displacement along the axis between the ends changes no image, so these 2 n + 2 parameters theta are all that there is
+to know of a curve this smooth.
 
-Moving the device by d moves its shadow in the noise-free image I by J d px, J the Jacobian of the projection at the nearest axis point. Before
-blur that makes dI/dtheta = -grad I . J dd/dtheta, which is then blurred as the image is. The gradient is measured: the scene's own renderer draws
-the shadow shifted by +-STEP_PX along u and v. What little more the device's apparent width and darkness say of its depth and slant is left out.
+Moving the device by d moves its shadow in the noise-free image I by J d px, J the Jacobian of the projection at the
+nearest axis point. Before blur that makes dI/dtheta = -grad I . J dd/dtheta, which is then blurred as the image is. The
+gradient is measured: the scene's own renderer draws the shadow shifted by +-STEP_PX along u and v. What little more the
+device's apparent width and darkness say of its depth and slant is left out.
 
-Pixels carry independent noise of known variance v, so the Fisher information is F = sum_pixels (dI/dtheta)(dI/dtheta)^T / v over both images,
-and no unbiased estimate has a covariance below C = F^-1 (Kay, Estimation Theory, 1993, ch. 3). From C follow, to first order,
+Pixels carry independent noise of known variance v, so the Fisher information is F = sum_pixels
+(dI/dtheta)(dI/dtheta)^T / v over both images, and no unbiased estimate has a covariance below C = F^-1 (Kay, Estimation
+Theory, 1993, ch. 3). From C follow, to first order,
 
-    E |d(s)| averaged over s: the mean closest-point distance. With l1 >= l2 the variances along the principal axes of the displacement across
-    the curve, E |d| = sqrt(2 l1 / pi) E(1 - l2 / l1), E the complete elliptic integral of the second kind;
+    E |d(s)| averaged over s: the mean closest-point distance. With l1 >= l2 the variances along the principal axes of
+    the displacement across the curve, E |d| = sqrt(2 l1 / pi) E(1 - l2 / l1), E the complete elliptic integral of the
+    second kind;
     the rms error of the tip, across and along the axis;
     the rms error of the length, dL = c1 - c0 - integral of kappa . d ds, kappa = dT/ds the curvature vector.
 """
@@ -35,7 +39,8 @@ from ..sim.scenes import Run
 
 KNOT_SPACING = 0.010    # m
 STEP_PX = 0.25          # of the shadow, to each side
-END = 0.0025            # m: so far an end carries along what is next to it when it slides; over as much again it lets go
+END = 0.0025            # m: so far an end carries along what is next to it when it slides;
+                        # over as much again it lets go
 MARGIN_PX = 12          # around the axis, for shadow and blur
 
 
@@ -49,7 +54,8 @@ class Bound:
 
 
 def bound(run: Run, knot_spacing: float = KNOT_SPACING) -> Bound:
-    """The bound of the pair at the start of a run. Raises ValueError where the device does not stand in both images with both ends."""
+    """The bound of the pair at the start of a run. Raises ValueError where the device does not stand in both images
+    with both ends."""
     curve = run.backbone()
     if min(f.room(curve).min() for f in run.fields) < 0:
         raise ValueError('the bound is that of a device with both ends in both images')
@@ -59,17 +65,21 @@ def bound(run: Run, knot_spacing: float = KNOT_SPACING) -> Bound:
     basis = spline_basis(s, knot_spacing)
     covariance = np.linalg.inv(sum(information(run, i, curve, tangent, normals, basis) for i in (0, 1)))
     n = basis.shape[1]
-    across = np.einsum('sj,jakb,sk->sab', basis, covariance[:-2, :-2].reshape(n, 2, n, 2), basis, optimize=True)     # (N, 2, 2) m^2
+    # (N, 2, 2) m^2
+    across = np.einsum('sj,jakb,sk->sab', basis, covariance[:-2, :-2].reshape(n, 2, n, 2), basis, optimize=True)
     step = np.gradient(s)
     of_length = length_change(s, tangent, normals, basis)
-    return Bound(float(np.average(mean_norm(across), weights=step)), float(np.sqrt(np.trace(across[-1]) + covariance[-1, -1])),
+    return Bound(float(np.average(mean_norm(across), weights=step)),
+                 float(np.sqrt(np.trace(across[-1]) + covariance[-1, -1])),
                  float(np.sqrt(of_length @ covariance @ of_length)))
 
 
-def information(run: Run, i: int, curve: np.ndarray, tangent: np.ndarray, normals: np.ndarray, basis: np.ndarray) -> np.ndarray:
+def information(run: Run, i: int, curve: np.ndarray, tangent: np.ndarray, normals: np.ndarray,
+                basis: np.ndarray) -> np.ndarray:
     """(2 n + 2, 2 n + 2) 1/m^2: what plane `i` tells of the parameters a_0, b_0, a_1, b_1 ..., c0, c1.
 
-    `curve` and `tangent` are (N, 3), `normals` (N, 3, 2), `basis` (N, n): the axis, its frame and the splines at the same points.
+    `curve` and `tangent` are (N, 3), `normals` (N, 3, 2), `basis` (N, n): the axis, its frame and the splines at the
+    same points.
     """
     view, s = run.fields[i].view, arc_length(curve)
     uv = project(view.P, curve)

@@ -1,7 +1,8 @@
 """Composites: a device with known truth on real, device-free X-ray backgrounds of a calibrated biplane system.
 
-The folder holds `background_plane_a.png`, `background_plane_b.png` (8 bit grey, nearly free of noise) and `calibration.json`: for `plane_a` and
-`plane_b` K (`K_corrected` where there is one), R and t of x = K (R X + t), X in m.
+The folder holds `background_plane_a.png`, `background_plane_b.png` (8 bit grey, nearly free of noise) and
+`calibration.json`: for `plane_a` and `plane_b` K (`K_corrected` where there is one), R and t of x = K (R X + t),
+X in m.
 """
 
 from __future__ import annotations
@@ -54,22 +55,28 @@ def load(folder: Path) -> Backgrounds:
     return Backgrounds(images, views, fields)
 
 
-def composite(seed: int, folder: Path, device: bool = True, masked: bool = False) -> tuple[Scene, tuple[np.ndarray, np.ndarray] | None]:
-    """A wire on the backgrounds of `folder` (every second one comes in through the border), and with `masked` the (H, W) float32 mask of each plane.
+def composite(seed: int, folder: Path, device: bool = True,
+              masked: bool = False) -> tuple[Scene, tuple[np.ndarray, np.ndarray] | None]:
+    """A wire on the backgrounds of `folder` (every second one comes in through the border), and with `masked` the
+    (H, W) float32 mask of each plane.
 
-    The image is background * exp(-mu * path length) + white noise. `device` False leaves the wire out; its truth then says where it would be.
+    The image is background * exp(-mu * path length) + white noise. `device` False leaves the wire out; its truth then
+    says where it would be.
     """
     real = load(folder)
-    shape, shaft = placement.place(np.random.default_rng([seed, 0]), real.fields, 'spline', LENGTHS, entering=bool(seed % 2))
+    shape, shaft = placement.place(np.random.default_rng([seed, 0]), real.fields, 'spline', LENGTHS,
+                                   entering=bool(seed % 2))
     whole = placement.with_shaft(shape.backbone(), shaft)
     rng = np.random.default_rng([seed, 1])
     exposure = xray.Exposure(contrast=rng.uniform(*CONTRASTS), blur_px=BLUR_PX)
     noise = rng.uniform(*NOISE)
-    shares = [xray.blurred(xray.transmission(whole, RADIUS, v, exposure), exposure) if device else 1.0 for v in real.views]
+    shares = [xray.blurred(xray.transmission(whole, RADIUS, v, exposure), exposure) if device else 1.0
+              for v in real.views]
     images = tuple(_noisy(image * share, noise, rng) for image, share in zip(real.images, shares))
     masks = None
     if masked:
-        masks = tuple(np.mean([_noisy(image, noise, rng) for _ in range(MASK_FRAMES)], axis=0, dtype=np.float32) for image in real.images)
+        masks = tuple(np.mean([_noisy(image, noise, rng) for _ in range(MASK_FRAMES)], axis=0, dtype=np.float32)
+                      for image in real.images)
     truth = placement.seen_in_both(whole, real.fields)
     return Scene(Frame(0, FRAME_ID, images, real.views), truth, RADIUS, truth[0], 'composite', seed), masks
 
@@ -89,4 +96,5 @@ def _image(file: Path) -> np.ndarray:
 
 def _view(plane: str, calibration: dict, size: tuple[int, int]) -> View:
     K = np.array(calibration.get('K_corrected', calibration['K']), float)
-    return make_view(plane, K @ np.c_[np.array(calibration['R'], float), np.array(calibration['t'], float)], size[1], size[0])
+    return make_view(plane, K @ np.c_[np.array(calibration['R'], float), np.array(calibration['t'], float)],
+                     size[1], size[0])

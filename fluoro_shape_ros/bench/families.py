@@ -1,8 +1,9 @@
 """Families of seeded scenes with known truth, by name: what the benches report on.
 
-ACCURACY scenes have nothing in them but the device, so that the Cramer-Rao bound applies. ROBUSTNESS scenes are X-ray images over anatomy
-(0.3 mm a pixel, planes 90 degrees apart, 1500 photons a pixel, 25 % contrast), each with one more difficulty. HARDER ones show what a prediction is worth.
-`variety` draws everything at random: device, geometry, anatomy, physics of the image and display; see sim/variety.py.
+ACCURACY scenes have nothing in them but the device, so that the Cramer-Rao bound applies. ROBUSTNESS scenes are X-ray
+images over anatomy (0.3 mm a pixel, planes 90 degrees apart, 1500 photons a pixel, 25 % contrast), each with one more
+difficulty. HARDER ones show what a prediction is worth. `variety` draws everything at random: device, geometry,
+anatomy, physics of the image and display; see sim/variety.py.
 """
 
 from __future__ import annotations
@@ -48,17 +49,24 @@ def families(real: Path | None = None) -> dict[str, Family]:
 def varied(sources: Sources = Sources()) -> dict[str, Family]:
     """The families drawn from a world as wide as the clinic; some exist only where their source is given."""
     found = {
-        'wide': Family('a solid rod: radius, contrast, geometry, dose, blur, scatter and display drawn', lambda seed: _varied(wide.wide_run(seed))),
-        'wide_anatomy': Family('the same before drawn anatomy', lambda seed: _varied(wide.wide_run(seed, anatomy=True))),
+        'wide': Family('a solid rod: radius, contrast, geometry, dose, blur, scatter and display drawn',
+                       lambda seed: _varied(wide.wide_run(seed))),
+        'wide_anatomy': Family('the same before drawn anatomy',
+                               lambda seed: _varied(wide.wide_run(seed, anatomy=True))),
         'wide_blank': Family('the same without the rod', lambda seed: _without(_rod_run(seed)), device=False),
-        'wide_one_plane': Family('the same with the rod in one plane only', lambda seed: _in_one_plane(_rod_run(seed)), device=False),
-        'devices': Family(f'{", ".join(presets())}, in turn, before drawn anatomy', lambda seed: _varied(wide.device_run(seed), kind=True)),
-        'gvxr': Family('tubes and rods in tissue, drawn by gVirtualXray at 0.2 mm a pixel', lambda seed: _varied(wide.gvxr_run(seed), kind=True)),
+        'wide_one_plane': Family('the same with the rod in one plane only', lambda seed: _in_one_plane(_rod_run(seed)),
+                                 device=False),
+        'devices': Family(f'{", ".join(presets())}, in turn, before drawn anatomy',
+                          lambda seed: _varied(wide.device_run(seed), kind=True)),
+        'gvxr': Family('tubes and rods in tissue, drawn by gVirtualXray at 0.2 mm a pixel',
+                       lambda seed: _varied(wide.gvxr_run(seed), kind=True)),
     }
     if sources.ct:
         found |= {
-            'ct': Family('the same devices in a CT, every second one entering through the border', lambda seed: _varied(wide.ct_run(seed, _volume(sources.ct)), kind=True)),
-            'ct_none': Family('the same without the device', lambda seed: _without(wide.ct_run(seed, _volume(sources.ct))), device=False),
+            'ct': Family('the same devices in a CT, every second one entering through the border',
+                         lambda seed: _varied(wide.ct_run(seed, _volume(sources.ct)), kind=True)),
+            'ct_none': Family('the same without the device',
+                              lambda seed: _without(wide.ct_run(seed, _volume(sources.ct))), device=False),
         }
     return found | ({'open': open_family(sources.open)} if sources.open else {})
 
@@ -78,7 +86,8 @@ def _rod_run(seed: int) -> Run:
 def _in_one_plane(run: Run) -> Case:
     scene, seen = run.scene(), run.seed % 2
     images = [scene.frame.images[i] if i == seen else run.without_device(index=1).images[i] for i in (0, 1)]
-    return Case(dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, images=tuple(images))), note=f'device in plane {"ab"[seen]} only')
+    return Case(dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, images=tuple(images))),
+                note=f'device in plane {"ab"[seen]} only')
 
 
 def _volume(file: Path) -> ct.Volume:
@@ -103,7 +112,8 @@ def _bare(run: Run) -> Case:
     return Case(run.scene(), run=run)
 
 
-def _xray(seed: int, *, pixel_size_iso: float = 0.3e-3, angle: float = np.pi / 2, photons: float = 1500.0, **options) -> Run:
+def _xray(seed: int, *, pixel_size_iso: float = 0.3e-3, angle: float = np.pi / 2, photons: float = 1500.0,
+          **options) -> Run:
     views = carm.biplane(angle_b=(angle, 0.0), arm=carm.CArm(pixel_size_iso=pixel_size_iso))
     return scenes.xray_run(seed, views=views, exposure=xray.Exposure(photons=photons), **options)
 
@@ -126,7 +136,8 @@ def _masked(seed: int) -> Case:
 
 
 def _moved(image: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
-    return cv2.warpAffine(image, np.c_[np.eye(2), shift_px], image.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.warpAffine(image, np.c_[np.eye(2), shift_px], image.shape[::-1], flags=cv2.INTER_CUBIC,
+                          borderMode=cv2.BORDER_REPLICATE)
 
 
 def _angled(seed: int) -> Case:
@@ -135,7 +146,8 @@ def _angled(seed: int) -> Case:
 
 
 def _miscalibrated(seed: int) -> Case:
-    """The scene of the same seed of `anatomy`, but plane B's principal point is not quite where its calibration says."""
+    """The scene of the same seed of `anatomy`, but plane B's principal point is not quite where its calibration
+    says."""
     scene, turn = _xray(seed).scene(), _rng(seed).uniform(0, 2 * np.pi)
     a, b = scene.frame.views
     shift = np.array([np.cos(turn), np.sin(turn), 0.0]) * CALIBRATION_ERROR_PX
@@ -149,7 +161,8 @@ def _plain_or_anatomy(seed: int) -> tuple[Run, str]:
     kind = seed // 2 % 3
     if kind == 0:
         return scenes.protocol_p_run(seed, 'xray'), 'protocol P'
-    return (_xray(seed), 'anatomy') if kind == 1 else (_xray(seed, clutter=('leads', 'text', 'blades')), 'anatomy, leads, text, blades')
+    return (_xray(seed), 'anatomy') if kind == 1 else (_xray(seed, clutter=('leads', 'text', 'blades')),
+                                                       'anatomy, leads, text, blades')
 
 
 def _blank(seed: int) -> Case:
@@ -168,24 +181,32 @@ def _one_plane(seed: int) -> Case:
 
 ACCURACY = {
     'p': Family('protocol P of Burgner et al. 2011, drawn by VTK', lambda seed: _bare(scenes.protocol_p_run(seed))),
-    'p_xray': Family('protocol P, drawn by the X-ray renderer', lambda seed: _bare(scenes.protocol_p_run(seed, 'xray'))),
-    'xray_02': Family('X-ray at 0.2 mm a pixel', lambda seed: _bare(_xray(seed, anatomy=False, pixel_size_iso=0.2e-3, lengths=SHORT))),
+    'p_xray': Family('protocol P, drawn by the X-ray renderer',
+                     lambda seed: _bare(scenes.protocol_p_run(seed, 'xray'))),
+    'xray_02': Family('X-ray at 0.2 mm a pixel',
+                      lambda seed: _bare(_xray(seed, anatomy=False, pixel_size_iso=0.2e-3, lengths=SHORT))),
     'xray_03': Family('X-ray at 0.3 mm a pixel', lambda seed: _bare(_xray(seed, anatomy=False))),
-    'low_dose': Family('X-ray at 0.3 mm a pixel, a tenth of the dose', lambda seed: _bare(_xray(seed, anatomy=False, photons=LOW_DOSE))),
+    'low_dose': Family('X-ray at 0.3 mm a pixel, a tenth of the dose',
+                       lambda seed: _bare(_xray(seed, anatomy=False, photons=LOW_DOSE))),
 }
 ROBUSTNESS = {
     'anatomy': Family('ribs, spine, vessels, soft tissue', lambda seed: Case(_xray(seed).scene())),
     'clutter': Family('and ECG leads, a second wire, text, blades or a circular field', _cluttered),
     'masked': Family('leads and a second wire, with a mask of a patient who has moved', _masked),
     'angles': Family('planes 35 to 125 degrees apart', _angled),
-    'tangent': Family('device tangent to its epipolar lines, which meet it twice', lambda seed: Case(_xray(seed, kind='tangent').scene())),
-    'crossing': Family('device crosses itself in an image', lambda seed: Case(_xray(seed, kind='crossing', lengths=LONG).scene())),
-    'occlusion': Family(f'{HIDDEN_PX:g} px of the device hidden in one plane', lambda seed: Case(_xray(seed, hidden_px=HIDDEN_PX).scene())),
+    'tangent': Family('device tangent to its epipolar lines, which meet it twice',
+                      lambda seed: Case(_xray(seed, kind='tangent').scene())),
+    'crossing': Family('device crosses itself in an image',
+                       lambda seed: Case(_xray(seed, kind='crossing', lengths=LONG).scene())),
+    'occlusion': Family(f'{HIDDEN_PX:g} px of the device hidden in one plane',
+                        lambda seed: Case(_xray(seed, hidden_px=HIDDEN_PX).scene())),
     'entering': Family('shaft comes in through the border', lambda seed: Case(_xray(seed, entering=True).scene())),
-    'calibration': Family(f'plane B\'s calibration off by {CALIBRATION_ERROR_PX:g} px; else the scenes of anatomy', _miscalibrated),
+    'calibration': Family(f'plane B\'s calibration off by {CALIBRATION_ERROR_PX:g} px; else the scenes of anatomy',
+                          _miscalibrated),
     'blank': Family('no device', _blank, device=False),
     'one_plane': Family('device in one plane only', _one_plane, device=False),
 }
 HARDER = {
-    'faint': Family('X-ray at 0.3 mm a pixel, a fortieth of the dose', lambda seed: _bare(_xray(seed, anatomy=False, photons=FAINT))),
+    'faint': Family('X-ray at 0.3 mm a pixel, a fortieth of the dose',
+                    lambda seed: _bare(_xray(seed, anatomy=False, photons=FAINT))),
 }

@@ -1,6 +1,8 @@
-"""How method/judge.py is calibrated: seeded scenes from the wide world, every curve that a search tries in them, and which of them are right.
+"""How method/judge.py is calibrated: seeded scenes from the wide world, every curve that a search tries in them, and
+which of them are right.
 
-No scene says how well it was learnt itself: the last calibration is cross-validated. The more curves were tried in a scene, the less each of them counts.
+No scene says how well it was learnt itself: the last calibration is cross-validated. The more curves were tried in a
+scene, the less each of them counts.
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ from ..method.tip import tip_of
 from ..metrics import compare
 from .families import Sources, families, varied
 
-FAMILIES = {'wide': 12, 'wide_anatomy': 13, 'devices': 12, 'ct': 8, 'wide_blank': 3, 'wide_one_plane': 3, 'anatomy': 1, 'clutter': 2, 'tangent': 1, 'crossing': 1,
+FAMILIES = {'wide': 12, 'wide_anatomy': 13, 'devices': 12, 'ct': 8, 'wide_blank': 3, 'wide_one_plane': 3, 'anatomy': 1,
+            'clutter': 2, 'tangent': 1, 'crossing': 1,
             'occlusion': 0.5, 'entering': 0.5, 'p_xray': 0.5, 'masked': 0.5, 'angles': 0.5}     # shares of the scenes
 FIRST_SEED = 20000
-RIDGE = 1e-4            # weight of the squared coefficients beside the mean loss: a feature that tells nothing gets none
+RIDGE = 1e-4        # weight of the squared coefficients beside the mean loss: a feature that tells nothing gets none
 FOLDS = 5
 LEAST = 200             # right curves, and wrong ones, that are needed
 LIMITS = 0.5, 0.9, 0.98, 0.99, 0.995, 0.999     # of confidence, in the table
@@ -58,7 +61,8 @@ class Curves:
 def tasks(scenes: int, first_seed: int, sources: Sources) -> list[Task]:
     """What to learn from: `scenes` times the shares of FAMILIES, as far as their sources are there."""
     known = families() | varied(sources)
-    return [Task(name, first_seed + k, sources) for name, share in FAMILIES.items() if name in known for k in range(round(scenes * share))]
+    return [Task(name, first_seed + k, sources) for name, share in FAMILIES.items() if name in known
+            for k in range(round(scenes * share))]
 
 
 def gather(task: Task) -> Curves:
@@ -66,7 +70,8 @@ def gather(task: Task) -> Curves:
     family = (families() | varied(task.sources))[task.family]
     case = family.make(task.seed)
     scene, device = case.scene, family.device and case.device
-    frame, config = scene.frame, Config.from_values(robot_radius=scene.radius, base_position=scene.base_position.tolist())
+    frame, config = scene.frame, Config.from_values(robot_radius=scene.radius,
+                                                    base_position=scene.base_position.tolist())
     cv2.setNumThreads(1)
     images = frame.images if case.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, case.masks))
     fields = [common_field(image, mask) for image, mask in zip(frame.images, case.masks or (None, None))]
@@ -82,16 +87,19 @@ def gather(task: Task) -> Curves:
                     first_sight=lambda points: float(model.log_odds(at_first_sight(points, sheet, scene.radius))))
     search.go_on()
     tried = search.tried
-    px = float(np.mean([1 / pixels_per_metre(v.P, scene.truth if device else isocenter(frame.views)[None]) for v in frame.views]))
+    px = float(np.mean([1 / pixels_per_metre(v.P, scene.truth if device else isocenter(frame.views)[None])
+                        for v in frame.views]))
     right = [device and is_right(t.fit.curve(200)[::1 if t.tip_is_last else -1], scene.truth, px) for t in tried]
     clash = np.zeros((len(tried), len(tried)), bool)
     for k, j in zip(*np.triu_indices(len(tried), 1)):
         clash[k, j] = clash[j, k] = exclusive(tried[k], tried[j])
-    return Curves(task.family, task.seed, device, np.array([t.features for t in tried]).reshape(-1, len(NAMES)), np.array(right, bool), clash)
+    return Curves(task.family, task.seed, device, np.array([t.features for t in tried]).reshape(-1, len(NAMES)),
+                  np.array(right, bool), clash)
 
 
 def is_right(points: np.ndarray, truth: np.ndarray, px: float) -> bool:
-    """Whether a curve (N, 3), base to tip, is as near the true one as the confidence promises; `px` is the size of a pixel at the device, m."""
+    """Whether a curve (N, 3), base to tip, is as near the true one as the confidence promises; `px` is the size of a
+    pixel at the device, m."""
     if cKDTree(truth).query(points)[0].mean() > 2 * max(MEAN, MEAN_PX * px):
         return False        # what is far off need not be measured
     errors = compare(points, truth)
@@ -99,19 +107,23 @@ def is_right(points: np.ndarray, truth: np.ndarray, px: float) -> bool:
 
 
 def learn(scenes: Sequence[Curves]) -> dict:
-    """The coefficients, as resource/judge.json has them; the last calibration is of what judges say that learnt from the other FOLDS - 1 parts of the scenes."""
+    """The coefficients, as resource/judge.json has them; the last calibration is of what judges say that learnt from
+    the other FOLDS - 1 parts of the scenes."""
     scenes = [s for s in scenes if len(s.right)]
     right = np.concatenate([s.right for s in scenes])
     if right.sum() < LEAST or (~right).sum() < LEAST:
-        raise ValueError(f'{right.sum()} right and {(~right).sum()} wrong curves are too few to learn from: {LEAST} of each are needed')
+        raise ValueError(f'{right.sum()} right and {(~right).sum()} wrong curves are too few to learn from: '
+                         f'{LEAST} of each are needed')
     said = []
     for k in range(FOLDS):
         judge = _fitted([s for s in scenes if s.seed % FOLDS != k])
         said += [chosen_of(judge, s) for s in scenes if s.seed % FOLDS == k]
     judge, (offset, slope) = _fitted(scenes), calibrate(said)
-    terms = {name: dict(typical=round(float(t), 4), scale=round(float(s), 4), near=round(float(n), 4), far=round(float(f), 4))
+    terms = {name: dict(typical=round(float(t), 4), scale=round(float(s), 4), near=round(float(n), 4),
+                        far=round(float(f), 4))
              for name, t, s, n, f in zip(NAMES, judge.typical, judge.scale, judge.near, judge.far)}
-    return dict(scenes=_counts(scenes), bias=round(judge.bias, 4), features=terms, offset=round(offset, 4), slope=round(slope, 4))
+    return dict(scenes=_counts(scenes), bias=round(judge.bias, 4), features=terms, offset=round(offset, 4),
+                slope=round(slope, 4))
 
 
 def _fitted(scenes: Sequence[Curves]) -> Judge:
@@ -127,10 +139,12 @@ def _fitted(scenes: Sequence[Curves]) -> Judge:
         z = w[0] + parts @ w[1:]
         p = 1 / (1 + np.exp(-np.clip(z, -40, 40)))
         slope = share * (p - right)
-        return share @ np.logaddexp(0, np.where(right, -z, z)) + RIDGE * w[1:] @ w[1:], np.append(slope.sum(), parts.T @ slope + 2 * RIDGE * w[1:])
+        return (share @ np.logaddexp(0, np.where(right, -z, z)) + RIDGE * w[1:] @ w[1:],
+                np.append(slope.sum(), parts.T @ slope + 2 * RIDGE * w[1:]))
 
     bounds = [(None, None)] + [(0, None)] * parts.shape[1]
-    w = minimize(loss, np.zeros(1 + parts.shape[1]), jac=True, bounds=bounds, method='L-BFGS-B', options=dict(maxiter=5000, maxfun=10000)).x
+    w = minimize(loss, np.zeros(1 + parts.shape[1]), jac=True, bounds=bounds, method='L-BFGS-B',
+                 options=dict(maxiter=5000, maxfun=10000)).x
     near, far = np.split(w[1:], 2)
     return Judge(float(w[0]), typical, scale, near, far, 0.0, 1.0)
 
@@ -138,26 +152,33 @@ def _fitted(scenes: Sequence[Curves]) -> Judge:
 def calibrate(said: Sequence[tuple[float, bool]]) -> tuple[float, float]:
     """Offset and slope of Platt's calibration of probabilities, each with whether it was right."""
     z, right = np.array([np.log(p / (1 - p)) for p, _ in said]), np.array([r for _, r in said])
-    loss = lambda w: float(np.logaddexp(0, np.where(right, -1, 1) * (w[0] + w[1] * z)).sum() + 0.05 * (w[0]**2 + (w[1] - 1)**2))      # noqa: E731
+    loss = lambda w: float(np.logaddexp(0, np.where(right, -1, 1) * (w[0] + w[1] * z)).sum()    # noqa: E731
+                           + 0.05 * (w[0]**2 + (w[1] - 1)**2))
     return tuple(float(x) for x in minimize(loss, [0.0, 1.0], method='Nelder-Mead').x)
 
 
 def table(judge: Judge, scenes: Sequence[Curves]) -> str:
-    """What the judge makes of scenes, by family: how often a right curve was tried, chosen, and published with a given confidence, and how many wrong ones."""
-    lines = [f'{"":15s} scenes   tried  chosen   published right, wrong with min_confidence ' + '  '.join(f'{c:g}' for c in LIMITS)]
+    """What the judge makes of scenes, by family: how often a right curve was tried, chosen, and published with a given
+    confidence, and how many wrong ones."""
+    lines = [f'{"":15s} scenes   tried  chosen   published right, wrong with min_confidence '
+             + '  '.join(f'{c:g}' for c in LIMITS)]
     chosen = [(s, *(chosen_of(judge, s) if len(s.right) else (0.0, False))) for s in scenes]
     for family in dict.fromkeys(s.family for s in scenes):
-        mine = [(s, judge.confidence(p) if len(s.right) else 0.0, right) for s, p, right in chosen if s.family == family]
-        counts = '   '.join(f'{sum(r and c >= least for _, c, r in mine):4d} {sum(not r and c >= least for _, c, r in mine):2d}' for least in LIMITS)
-        lines.append(f'{family:15s} {len(mine):6d} {sum(bool(s.right.any()) for s, _, _ in mine):7d} {sum(r for *_, r in mine):7d}   {counts}')
+        mine = [(s, judge.confidence(p) if len(s.right) else 0.0, right)
+                for s, p, right in chosen if s.family == family]
+        counts = '   '.join(f'{sum(r and c >= least for _, c, r in mine):4d} '
+                            f'{sum(not r and c >= least for _, c, r in mine):2d}' for least in LIMITS)
+        lines.append(f'{family:15s} {len(mine):6d} {sum(bool(s.right.any()) for s, _, _ in mine):7d} '
+                     f'{sum(r for *_, r in mine):7d}   {counts}')
     return '\n'.join(lines)
 
 
 def _counts(scenes: Sequence[Curves]) -> dict:
     """How many scenes of each family there were, with which seeds, and how many right and wrong curves in them."""
-    return {family: dict(scenes=len(mine), seeds=[min(s.seed for s in mine), max(s.seed for s in mine)], right=int(sum(s.right.sum() for s in mine)),
-                         wrong=int(sum((~s.right).sum() for s in mine)))
-            for family in dict.fromkeys(s.family for s in scenes) if (mine := [s for s in scenes if s.family == family])}
+    return {family: dict(scenes=len(mine), seeds=[min(s.seed for s in mine), max(s.seed for s in mine)],
+                         right=int(sum(s.right.sum() for s in mine)), wrong=int(sum((~s.right).sum() for s in mine)))
+            for family in dict.fromkeys(s.family for s in scenes)
+            if (mine := [s for s in scenes if s.family == family])}
 
 
 def chosen_of(judge: Judge, scene: Curves) -> tuple[float, bool]:

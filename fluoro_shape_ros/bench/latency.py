@@ -61,7 +61,8 @@ class Row:
 
 
 def choose_profile(as_shipped: bool) -> None:
-    """The Fast DDS profile of this process and its children: the package's unless the user has one, or none. Before anything uses ROS."""
+    """The Fast DDS profile of this process and its children: the package's unless the user has one, or none. Before
+    anything uses ROS."""
     if as_shipped:
         for name in PROFILES:
             os.environ.pop(name, None)
@@ -71,7 +72,8 @@ def choose_profile(as_shipped: bool) -> None:
 
 
 def moving_scenes(size: int, rate: float, seed: int, count: int) -> list[scenes.Scene]:
-    """`count` successive pairs, `rate` a second, of a device whose fastest point moves at about SPEED in front of anatomy."""
+    """`count` successive pairs, `rate` a second, of a device whose fastest point moves at about SPEED in front of
+    anatomy."""
     views = biplane(arm=CArm(pixel_size_iso=FIELD / size, width=size, height=size))
     run = scenes.xray_run(seed, views=views, entering=True)
     dt = 0.01
@@ -83,28 +85,34 @@ def moving_scenes(size: int, rate: float, seed: int, count: int) -> list[scenes.
 
 
 @contextlib.contextmanager
-def timed_node(scene: scenes.Scene, folder: Path, parameters: dict[str, object] | None = None) -> Iterator[subprocess.Popen]:
-    """The node as a process that knows what a user knows of the scene; it logs into `folder`/node.log, and laps into `folder`/laps."""
-    given = {'robot_radius': float(scene.radius), 'base_position': [round(float(x), 6) for x in scene.base_position], 'reference_frame': scene.frame.frame_id,
-             **(parameters or {})}
+def timed_node(scene: scenes.Scene, folder: Path,
+               parameters: dict[str, object] | None = None) -> Iterator[subprocess.Popen]:
+    """The node as a process that knows what a user knows of the scene; it logs into `folder`/node.log, and laps into
+    `folder`/laps."""
+    given = {'robot_radius': float(scene.radius), 'base_position': [round(float(x), 6) for x in scene.base_position],
+             'reference_frame': scene.frame.frame_id, **(parameters or {})}
     words = [word for name, value in given.items() for word in ('-p', f'{name}:={value}')]
-    with child(['-m', 'fluoro_shape_ros.bench.timed_node', str(folder / 'laps'), '--ros-args', *words], folder / 'node.log') as process:
+    with child(['-m', 'fluoro_shape_ros.bench.timed_node', str(folder / 'laps'), '--ros-args', *words],
+               folder / 'node.log') as process:
         yield process
 
 
 def first_result(probe, rate: float, process: subprocess.Popen, folder: Path, since: float) -> float:
-    """Seconds from `since` (time.monotonic) to the first Path. Raises ToolError, with the node's last words, where none comes."""
+    """Seconds from `since` (time.monotonic) to the first Path. Raises ToolError, with the node's last words, where none
+    comes."""
     gone = lambda: process.poll() is not None      # noqa: E731
     probe.until(lambda: probe.connected() or gone(), STARTUP_S)
     probe.stream(rate, STARTUP_S, stop=lambda: probe.answered or gone())
     if not probe.answered:
         log = (folder / 'node.log').read_text(errors='replace').strip().splitlines()
-        raise cli.ToolError(f'the node gave no result within {STARTUP_S:.0f} s{f", its last words: {log[-1]}" if log else ""}')
+        raise cli.ToolError(f'the node gave no result within {STARTUP_S:.0f} '
+                            f's{f", its last words: {log[-1]}" if log else ""}')
     return min(probe.answered.values()) - since
 
 
 def measure(rate: float, seconds: float, pairs: list[scenes.Scene], tracking: bool = True) -> Row:
-    """Stream `rate` of the pairs a second, forth and back, to a node of its own for so many seconds. Raises ToolError where it gives no result."""
+    """Stream `rate` of the pairs a second, forth and back, to a node of its own for so many seconds. Raises ToolError
+    where it gives no result."""
     from .stopwatch import Probe  # needs ROS
     with tempfile.TemporaryDirectory() as name, Probe(pairs) as probe:
         folder, start = Path(name), time.monotonic()
@@ -123,21 +131,25 @@ def measure(rate: float, seconds: float, pairs: list[scenes.Scene], tracking: bo
     sent = [stamp for stamp in probe.sent if begin_ns <= stamp < end_ns]
     answered = [stamp for stamp in sent if stamp in probe.answered and str(stamp) in took]
     heard = [begin, *(t for t, _ in probe.reports if begin < t < end), end]
-    return Row(rate, end - begin, len(sent), len(answered), counts['refused'] - counted['refused'], counts['dropped'] - counted['dropped'],
-               [probe.answered[s] - probe.sent[s] for s in answered], [float(took[str(s)]) for s in answered], list(probe.calls),
-               float(np.diff(heard).max()), (after.cpu_s - before.cpu_s) / (end - begin), after.resident, after.peak, first,
-               [probe.tip_errors[s] for s in answered if s in probe.tip_errors])
+    return Row(rate, end - begin, len(sent), len(answered), counts['refused'] - counted['refused'],
+               counts['dropped'] - counted['dropped'], [probe.answered[s] - probe.sent[s] for s in answered],
+               [float(took[str(s)]) for s in answered], list(probe.calls),
+               float(np.diff(heard).max()), (after.cpu_s - before.cpu_s) / (end - begin), after.resident, after.peak,
+               first, [probe.tip_errors[s] for s in answered if s in probe.tip_errors])
 
 
 def table(rows: list[Row], as_shipped: bool) -> str:
     """A line a rate for a terminal, and what the columns mean."""
-    lines = [f'{"":>7s} {"pairs":^41s} | {"latency (ms)":^29s} | {"compute":^13s} | {"rest":^13s} | {"services":^13s} | {"node":^28s} | tip',
-             f'{"rate":>7s} {"sent/s":>6s} {"sent":>6s} {"answered":>8s} {"refused":>7s} {"dropped":>7s} {"lost":>4s} | {"median":>7s} {"p95":>6s} {"p99":>6s} {"worst":>7s} | '
-             f'{"median":>6s} {"p95":>6s} | {"median":>6s} {"p95":>6s} | {"p95":>6s} {"worst":>6s} | {"cores":>5s} {"MB":>5s} {"peak":>5s} {"first s":>7s} | mm']
+    lines = [f'{"":>7s} {"pairs":^41s} | {"latency (ms)":^29s} | {"compute":^13s} | {"rest":^13s} | {"services":^13s} '
+             f'| {"node":^28s} | tip',
+             f'{"rate":>7s} {"sent/s":>6s} {"sent":>6s} {"answered":>8s} {"refused":>7s} {"dropped":>7s} {"lost":>4s} '
+             f'| {"median":>7s} {"p95":>6s} {"p99":>6s} {"worst":>7s} | {"median":>6s} {"p95":>6s} | {"median":>6s} '
+             f'{"p95":>6s} | {"p95":>6s} {"worst":>6s} | {"cores":>5s} {"MB":>5s} {"peak":>5s} {"first s":>7s} | mm']
     lines += [_line(row) for row in rows]
     profile = 'as shipped' if as_shipped else os.environ.get(PROFILES[0]) or os.environ.get(PROFILES[1]) or 'no profile'
     return '\n'.join([*lines, '', f"""\
-latency   from handing over the second image of a pair to having its Path, not yet as Python objects; compute: the reconstruction's share of it; rest: the difference, pair by pair
+latency   from handing over the second image of a pair to having its Path, not yet as Python objects;
+          compute: the reconstruction's share of it; rest: the difference, pair by pair
 dropped   overtaken by a newer pair, as the node counts it; lost: known to nobody
 services  ms that ~/clear_mask and set_parameters, called four times a second, took to answer meanwhile
 node      cores it kept busy, resident memory at the end and at most, s from its start to the first result
@@ -146,11 +158,14 @@ Fast DDS  {profile}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"""])
 
 
 def _line(r: Row) -> str:
-    pairs = f'{r.rate:7g} {r.sent / r.seconds:6.1f} {r.sent:6d} {r.answered:8d} {r.refused:7d} {r.dropped:7d} {r.lost:4d}'
+    pairs = (f'{r.rate:7g} {r.sent / r.seconds:6.1f} {r.sent:6d} {r.answered:8d} {r.refused:7d} {r.dropped:7d} '
+             f'{r.lost:4d}')
     node = f'{r.cores:5.2f} {r.resident / 1e6:5.0f} {r.peak / 1e6:5.0f} {r.first_result:7.2f}'
     tip = f'{np.median(r.tip_errors) * 1e3:.2f}' if r.tip_errors else '-'
-    return (f'{pairs} | {_ms(r.latency, 50):>7s} {_ms(r.latency, 95):>6s} {_ms(r.latency, 99):>6s} {_ms(r.latency, 100):>7s} | {_ms(r.compute, 50):>6s} '
-            f'{_ms(r.compute, 95):>6s} | {_ms(r.overhead, 50):>6s} {_ms(r.overhead, 95):>6s} | {_ms(r.services, 95):>6s} {_ms(r.services, 100):>6s} | {node} | {tip}')
+    return (f'{pairs} | {_ms(r.latency, 50):>7s} {_ms(r.latency, 95):>6s} {_ms(r.latency, 99):>6s} '
+            f'{_ms(r.latency, 100):>7s} | {_ms(r.compute, 50):>6s} '
+            f'{_ms(r.compute, 95):>6s} | {_ms(r.overhead, 50):>6s} {_ms(r.overhead, 95):>6s} | '
+            f'{_ms(r.services, 95):>6s} {_ms(r.services, 100):>6s} | {node} | {tip}')
 
 
 def _ms(seconds, percentile: float) -> str:

@@ -43,11 +43,13 @@ class Memory:
     def slope(self) -> float:
         """Bytes a pair after warming up, by least squares."""
         warm = int(len(self.resident) * WARM_UP)
-        return float(np.polyfit(self.after[warm:], self.resident[warm:], 1)[0]) if len(self.resident) - warm > 1 else 0.0
+        return (float(np.polyfit(self.after[warm:], self.resident[warm:], 1)[0])
+                if len(self.resident) - warm > 1 else 0.0)
 
 
 def measure(pairs: int, scenes: list[Scene], everything: bool = False) -> Memory:
-    """Let a node of its own answer so many pairs, `scenes` forth and back; `everything`: with a subscriber to all that it computes on demand too.
+    """Let a node of its own answer so many pairs, `scenes` forth and back; `everything`: with a subscriber to all that
+    it computes on demand too.
 
     Raises ToolError where the node gives no result, or ends.
     """
@@ -75,5 +77,6 @@ def report(m: Memory, size: int) -> str:
     mb = [f'{m.resident[round(share * (len(m.resident) - 1))] / 1e6:.1f}' for share in (0, WARM_UP, 0.25, 0.5, 0.75, 1)]
     return '\n'.join([
         f'{m.answered} of {m.pairs} pairs of {size} px answered in {m.seconds:.0f} s',
-        f'resident MB at first, after 10 %, 25 %, 50 %, 75 % and all pairs: {", ".join(mb)}; at most {m.peak / 1e6:.1f}',
+        f'resident MB at first, after 10 %, 25 %, 50 %, 75 % and all pairs: {", ".join(mb)}; '
+        f'at most {m.peak / 1e6:.1f}',
         f'growth after the first 10 %: {m.growth / 1e6:+.2f} MB; slope {m.slope * 1e4 / 1e6:+.2f} MB in 10000 pairs'])

@@ -1,7 +1,9 @@
-"""Scenes with known truth that were made elsewhere: a folder of folders, each with `plane_a.png`, `plane_b.png` (8 or 16 bit grey) and `scene.json`.
+"""Scenes with known truth that were made elsewhere: a folder of folders, each with `plane_a.png`, `plane_b.png` (8 or
+16 bit grey) and `scene.json`.
 
-`scene.json` holds P_a and P_b (3x4, reference frame in m to px), radius_m, backbone_m (N x 3, base to tip, the part that stands in both fields; empty where
-there is no device), device (whether both images show one) and family (what kind of scene it is).
+`scene.json` holds P_a and P_b (3x4, reference frame in m to px), radius_m, backbone_m (N x 3, base to tip, the part
+that stands in both fields; empty where there is no device), device (whether both images show one) and family (what kind
+of scene it is).
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ IMAGES, ABOUT = ('plane_a.png', 'plane_b.png'), 'scene.json'
 
 @functools.lru_cache(maxsize=1)
 def open_family(folder: Path) -> Family:
-    """The scenes in the folders of `folder`: seed 0 is the first by name. Raises ToolError that names the folder or file that is missing."""
+    """The scenes in the folders of `folder`: seed 0 is the first by name. Raises ToolError that names the folder or
+    file that is missing."""
     if not folder.is_dir():
         raise ToolError(f'{folder}: there is no such folder')
     scenes = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith('.'))
@@ -39,13 +42,15 @@ def open_family(folder: Path) -> Family:
 
 
 def open_case(folder: Path, seed: int = 0) -> Case:
-    """The scene in `folder`. Without a backbone its truth is (0, 3) and its base_position (0,): unknown. Raises ToolError that names what makes no sense."""
+    """The scene in `folder`. Without a backbone its truth is (0, 3) and its base_position (0,): unknown. Raises
+    ToolError that names what makes no sense."""
     file = folder / ABOUT
     images = tuple(_image(folder / name) for name in IMAGES)
     try:
         about = json.loads(file.read_bytes())
         truth, device = _backbone(about), _flag(about, 'device')
-        views = tuple(make_view(plane, _numbers(about, f'P_{plane}'), image.shape[1], image.shape[0]) for plane, image in zip('ab', images))
+        views = tuple(make_view(plane, _numbers(about, f'P_{plane}'), image.shape[1], image.shape[0])
+                      for plane, image in zip('ab', images))
         radius, kind = _numbers(about, 'radius_m'), str(about['family'])
         if radius.shape or not 0 < radius < 1:
             raise ValueError(f'radius_m is {about["radius_m"]}')
@@ -55,7 +60,8 @@ def open_case(folder: Path, seed: int = 0) -> Case:
         raise ToolError(f'{file}: {error.args[0]} is missing') from error
     except (ValueError, TypeError, GeometryError) as error:     # ValueError: json's too
         raise ToolError(f'{file}: {error}') from error
-    scene = Scene(Frame(0, FRAME_ID, images, views), truth, float(radius), truth[0] if len(truth) else np.empty(0), kind, seed)
+    scene = Scene(Frame(0, FRAME_ID, images, views), truth, float(radius), truth[0] if len(truth) else np.empty(0),
+                  kind, seed)
     return Case(scene, note=folder.name, kind=kind, device=device)
 
 

@@ -1,4 +1,5 @@
-"""The bench as a picture: every scene's errors on logarithmic axes, and what share of the scenes was answered how. Needs matplotlib."""
+"""The bench as a picture: every scene's errors on logarithmic axes, and what share of the scenes was answered how.
+Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def draw(trials: Sequence[Trial], file: Path) -> None:
     top, bottom, total = 0.75, 0.75, height + 1.5       # inches
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(15, total), dpi=100)
-        axes = [figure.add_axes((left, bottom / total, width, height / total)) for left, width in ((0.085, 0.3), (0.4, 0.3), (0.715, 0.215))]
+        axes = [figure.add_axes((left, bottom / total, width, height / total))
+                for left, width in ((0.085, 0.3), (0.4, 0.3), (0.715, 0.215))]
         for ax, (name, label, limit) in zip(axes, PANELS):
             _errors(ax, families, methods, name, pitch)
             ax.axvline(limit * 1e3, color=TEXT, lw=0.8, ls='--', zorder=0)
@@ -60,7 +62,8 @@ def _errors(ax, families, methods, name: str, pitch: float) -> None:
     """Dots for scenes, a bar from the median to the 95th percentile, a tick for the bound."""
     for k, trials in enumerate(families.values()):
         if not any(a.device for t in trials for a in t.answers.values()):
-            ax.text(0.5, k * pitch + (len(methods) - 1) / 2, 'nothing may be published', transform=ax.get_yaxis_transform(), ha='center', va='center',
+            ax.text(0.5, k * pitch + (len(methods) - 1) / 2, 'nothing may be published',
+                    transform=ax.get_yaxis_transform(), ha='center', va='center',
                     color=TEXT, alpha=0.5, fontsize=9, style='italic')
         for m, method in enumerate(methods):
             mm = np.array([getattr(t.answers[method].errors, name) for t in trials if t.answers[method].errors]) * 1e3
@@ -73,7 +76,8 @@ def _errors(ax, families, methods, name: str, pitch: float) -> None:
                 ax.plot([median], [y], 'o', color=TRUTH, ms=5)
                 ax.plot([p95], [y], '|', color=TRUTH, ms=9, mew=1.2)
         if bounds := [getattr(t.bound, name) for t in trials if t.bound]:
-            ax.plot([np.mean(bounds) * 1e3] * 2, [k * pitch - 0.5, k * pitch + len(methods) - 0.5], color='#7ee081', lw=2)
+            ax.plot([np.mean(bounds) * 1e3] * 2, [k * pitch - 0.5, k * pitch + len(methods) - 0.5],
+                    color='#7ee081', lw=2)
 
 
 def _shares(ax, families, methods, pitch: float) -> None:
@@ -86,7 +90,8 @@ def _shares(ax, families, methods, pitch: float) -> None:
                 ax.barh(k * pitch + m, part, left=left, height=0.7, color=colour)
                 left += part
             right = sum(map(SHARES[0][2], answers))
-            ax.text(102, k * pitch + m, f'{method}  {share(right, len(answers))}', va='center', fontsize=9, color=COLOURS[m % len(COLOURS)])
+            ax.text(102, k * pitch + m, f'{method}  {share(right, len(answers))}', va='center', fontsize=9,
+                    color=COLOURS[m % len(COLOURS)])
     ax.set(xlim=(0, 100), xlabel='share of the scenes (%)')
 
 
@@ -94,7 +99,8 @@ def _legends(figure, axes, methods, top: float) -> None:
     """What the marks mean, above the panels."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
-    marks = [Line2D([], [], ls='', marker='o', ms=5, color=COLOURS[m % len(COLOURS)], label=f'{method}: a scene') for m, method in enumerate(methods)]
+    marks = [Line2D([], [], ls='', marker='o', ms=5, color=COLOURS[m % len(COLOURS)], label=f'{method}: a scene')
+             for m, method in enumerate(methods)]
     marks += [Line2D([], [], color=TRUTH, marker='o', ms=5, lw=1.2, label='median to 95th percentile'),
               Line2D([], [], color='#7ee081', lw=2, label='Cramér-Rao bound'),
               Line2D([], [], color=TEXT, lw=0.8, ls='--', label='limit of "within"')]

@@ -1,4 +1,5 @@
-"""Whether confidence is what it says: a reliability diagram, and what is answered and wrong over min_confidence. Needs matplotlib."""
+"""Whether confidence is what it says: a reliability diagram, and what is answered and wrong over min_confidence. Needs
+matplotlib."""
 
 from __future__ import annotations
 
@@ -30,10 +31,13 @@ def draw(answers: Sequence[Answer], file: Path) -> None:
                 share, error = right[mine].mean(), np.sqrt(right[mine].mean() * (1 - right[mine].mean()) / mine.sum())
                 left.errorbar(said[mine].mean(), share, 2 * error, fmt='o', color=FOUND, ms=6)
                 left.annotate(f' {mine.sum()}', (said[mine].mean(), share), color=TEXT, fontsize=9)
-        left.set(xlabel='confidence said', ylabel='share that is right', xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title='how often it is right (number of pairs)')
+        left.set(xlabel='confidence said', ylabel='share that is right', xlim=(-0.02, 1.02), ylim=(-0.02, 1.02),
+                 title='how often it is right (number of pairs)')
         least = 1 - np.geomspace(1e-4, 1, 200)
-        curve.plot(1 - least, [100 * np.sum(right & (said >= c)) / max(len(answers), 1) for c in least], color=FOUND, label='published and right (% of all pairs)')
-        curve.plot(1 - least, [100 * np.sum(wrong & (said >= c)) / max(int(np.sum(said >= c)), 1) for c in least], color=TIP, label='silent failures (% of what is published)')
+        curve.plot(1 - least, [100 * np.sum(right & (said >= c)) / max(len(answers), 1) for c in least], color=FOUND,
+                   label='published and right (% of all pairs)')
+        curve.plot(1 - least, [100 * np.sum(wrong & (said >= c)) / max(int(np.sum(said >= c)), 1) for c in least],
+                   color=TIP, label='silent failures (% of what is published)')
         curve.set(xscale='log', xlabel='1 - min_confidence', ylim=(0, 100), title='answered against silent')
         curve.legend(frameon=False)
         figure.savefig(file, format='png')

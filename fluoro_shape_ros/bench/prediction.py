@@ -1,4 +1,5 @@
-"""What a kinematic model's prediction is worth: the first pair of a scene with a good one, without, and with wrong ones."""
+"""What a kinematic model's prediction is worth: the first pair of a scene with a good one, without, and with wrong
+ones."""
 
 from __future__ import annotations
 
@@ -56,13 +57,15 @@ def predictions(truth: np.ndarray, seed: int) -> dict[str, np.ndarray | None]:
     across /= np.linalg.norm(across)
     aside = rng.normal(size=3)
     other = random_cannula(rng, 0.12).backbone()
-    turn, _ = Rotation.align_vectors((ahead / np.linalg.norm(ahead))[None], (other[1] - other[0])[None] / np.linalg.norm(other[1] - other[0]))
+    turn, _ = Rotation.align_vectors((ahead / np.linalg.norm(ahead))[None],
+                                     (other[1] - other[0])[None] / np.linalg.norm(other[1] - other[0]))
     kinds = {WITHOUT: None, GOOD: good,
              'mirrored': base + (good - base) - 2 * ((good - base) @ across)[:, None] * across,
              'shifted': good + SHIFT * aside / np.linalg.norm(aside),
              'reversed': good[::-1],
              'another': base + turn.apply(other - other[0])}
-    return {kind: None if points is None else points[np.linspace(0, len(points) - 1, POSES).round().astype(int)] for kind, points in kinds.items()}
+    return {kind: None if points is None else points[np.linspace(0, len(points) - 1, POSES).round().astype(int)]
+            for kind, points in kinds.items()}
 
 
 def tries(case: Case, rounds: int) -> dict[str, Try]:
@@ -76,7 +79,8 @@ def tries(case: Case, rounds: int) -> dict[str, Try]:
             start = time.perf_counter()
             results[kind] = reconstruct(scene.frame, config, Prior(masks=case.masks, predicted=points))
             seconds[kind].append(time.perf_counter() - start)
-    return {kind: Try(answer_of(case, result), min(seconds[kind]), _difference(result, results[WITHOUT]), result.prediction)
+    return {kind: Try(answer_of(case, result), min(seconds[kind]), _difference(result, results[WITHOUT]),
+                      result.prediction)
             for kind, result in results.items()}
 
 
@@ -89,10 +93,11 @@ def _difference(one: Reconstruction, other: Reconstruction) -> float:
 
 def report(names: list[str], count: int, first_seed: int, rounds: int) -> str:
     """The table: a row a family and kind of prediction."""
-    lines = [f'{"family":10s} {"prediction":10s} {"answered":>8s} {"within":>7s} {"silent":>6s} {"mean mm":>8s} {"tip mm":>7s} {"cost":>5s} {"same":>8s} '
-             f'{"differs mm":>10s}  what became of it']
+    lines = [f'{"family":10s} {"prediction":10s} {"answered":>8s} {"within":>7s} {"silent":>6s} {"mean mm":>8s} '
+             f'{"tip mm":>7s} {"cost":>5s} {"same":>8s} {"differs mm":>10s}  what became of it']
     for name in names:
-        done = [tries(families()[name].make(first_seed + k), rounds) for k in tqdm(range(count), name, unit='scene', disable=None, leave=False)]
+        done = [tries(families()[name].make(first_seed + k), rounds)
+                for k in tqdm(range(count), name, unit='scene', disable=None, leave=False)]
         lines += [_line(name, kind, [d[kind] for d in done], [d[WITHOUT] for d in done]) for kind in done[0]]
     return '\n'.join([*lines, '', LEGEND])
 
@@ -100,8 +105,10 @@ def report(names: list[str], count: int, first_seed: int, rounds: int) -> str:
 LEGEND = f"""\
 within     mean <= 0.3 mm and tip <= 1 mm; mean and tip: mean errors of the answers
 cost       time without a prediction over time with it, median; the first pair, so nothing is tracked
-same       answers that equal those without within {SAME * 1e3:g} mm everywhere, or rejected alike; differs: the most that two answers differ
-good       the robot's tip is pushed {PUSHED * 500:g} to {PUSHED * 1000:g} mm from where the model has it; the wrong ones are made from it"""
+same       answers that equal those without within {SAME * 1e3:g} mm everywhere, or rejected alike;
+           differs: the most that two answers differ
+good       the robot's tip is pushed {PUSHED * 500:g} to {PUSHED * 1000:g} mm from where the model has it;
+           the wrong ones are made from it"""
 
 
 def _line(family: str, kind: str, done: list[Try], without: list[Try]) -> str:
@@ -111,6 +118,8 @@ def _line(family: str, kind: str, done: list[Try], without: list[Try]) -> str:
     cost = np.median([b.seconds / a.seconds for a, b in zip(done, without)])
     fates = Counter(t.fate.split(':')[0] for t in done if t.fate)
     differences = [t.difference for t in done]
-    return (f'{family:10s} {kind:10s} {sum(a.published for a in answers):3d} of {len(done):<2d} {sum(a.within for a in answers):7d} '
-            f'{sum(a.silent_failure for a in answers):6d} {mean:8.3f} {tip:7.3f} {cost:5.2f} {sum(d <= SAME for d in differences):2d} of {len(done):<2d} '
-            f'{1e3 * np.nanmax(differences, initial=0.0):10.3f}  ' + ', '.join(f'{n} {fate}' for fate, n in fates.most_common())).rstrip()
+    return (f'{family:10s} {kind:10s} {sum(a.published for a in answers):3d} of {len(done):<2d} '
+            f'{sum(a.within for a in answers):7d} {sum(a.silent_failure for a in answers):6d} {mean:8.3f} {tip:7.3f} '
+            f'{cost:5.2f} {sum(d <= SAME for d in differences):2d} of {len(done):<2d} '
+            f'{1e3 * np.nanmax(differences, initial=0.0):10.3f}  '
+            + ', '.join(f'{n} {fate}' for fate, n in fates.most_common())).rstrip()

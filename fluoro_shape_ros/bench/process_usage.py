@@ -18,7 +18,8 @@ class Usage:
 
 
 def usage(pid: int) -> Usage:
-    """Of a process and its children; memory that they share counts for each. Raises OSError where there is no such process (any more), or no /proc."""
+    """Of a process and its children; memory that they share counts for each. Raises OSError where there is no such
+    process (any more), or no /proc."""
     uses = [_alone(pid), *_of_children(pid)]
     return Usage(sum(u.cpu_s for u in uses), sum(u.resident for u in uses), sum(u.peak for u in uses))
 

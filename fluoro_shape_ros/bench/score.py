@@ -78,7 +78,8 @@ class Task:
     base: bool = True                   # whether the base's position is given
     radius_error: float = 0.0           # the radius given is off by this share of the true one
     min_confidence: float | None = None # instead of the parameter's default
-    picture: str = ''                   # which answers of the first method are worth a thumbnail, one of PICTURES; '': none
+    picture: str = ''                   # which answers of the first method are worth a thumbnail, one of PICTURES;
+                                        # '': none
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ def attempt(task: Task) -> Trial:
         raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
     try:
         least = {} if task.min_confidence is None else {'min_confidence': task.min_confidence}
-        answers = {method: answer(case, Config.from_values(method=method, **least), family.device, task.base, task.radius_error) for method in task.methods}
+        answers = {method: answer(case, Config.from_values(method=method, **least), family.device, task.base,
+                                  task.radius_error) for method in task.methods}
     except ConfigError as error:    # a radius that no device has
         raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
     first = next(iter(answers.values()))
@@ -124,12 +126,15 @@ def family_of(task: Task) -> Family:
 
 
 def answer(case: Case, config: Config, device: bool = True, base: bool = True, radius_error: float = 0.0) -> Answer:
-    """What the pipeline says of one scene. The device's radius and its base's position are given, as a robot's user would.
+    """What the pipeline says of one scene. The device's radius and its base's position are given, as a robot's user
+    would.
 
-    The radius is off by a share `radius_error`; the base's position is kept back without `base`, and where a scene has none. Raises ConfigError.
+    The radius is off by a share `radius_error`; the base's position is kept back without `base`, and where a scene has
+    none. Raises ConfigError.
     """
     scene = case.scene
-    config = config.replace(robot_radius=scene.radius * (1 + radius_error), base_position=scene.base_position.tolist() if base else [])
+    config = config.replace(robot_radius=scene.radius * (1 + radius_error),
+                            base_position=scene.base_position.tolist() if base else [])
     start = time.process_time()
     result = reconstruct(scene.frame, config, Prior(masks=case.masks))
     cpu_s = time.process_time() - start
@@ -139,14 +144,16 @@ def answer(case: Case, config: Config, device: bool = True, base: bool = True, r
 def answer_of(case: Case, result: Reconstruction, device: bool = True) -> Answer:
     """How far off a result for a scene is. `device` False: it shows none, whatever the case says."""
     scene = case.scene
-    found = Answer(scene.seed, result.outcome, device and case.device, note=case.note, detail=result.detail, kind=case.kind, px_m=pixel_size(scene),
-                   confidence=result.confidence)
+    found = Answer(scene.seed, result.outcome, device and case.device, note=case.note, detail=result.detail,
+                   kind=case.kind, px_m=pixel_size(scene), confidence=result.confidence)
     if result.shape is None or not found.device:
         return found
     shape = result.shape
-    return dataclasses.replace(found, errors=compare(shape.points, scene.truth), surprise=surprise(shape.tip - scene.truth[-1], shape.covariance[-1]))
+    return dataclasses.replace(found, errors=compare(shape.points, scene.truth),
+                               surprise=surprise(shape.tip - scene.truth[-1], shape.covariance[-1]))
 
 
 def pixel_size(scene: Scene) -> float:
     """m a pixel at the device, the mean of both planes; NaN where no device is."""
-    return float(np.mean([1 / pixels_per_metre(v.P, scene.truth) for v in scene.frame.views])) if len(scene.truth) else math.nan
+    return (float(np.mean([1 / pixels_per_metre(v.P, scene.truth) for v in scene.frame.views]))
+            if len(scene.truth) else math.nan)

@@ -1,4 +1,5 @@
-"""Contact sheets: pairs of images as a person sees them, ten a sheet, with a line of text below each and nothing drawn on them."""
+"""Contact sheets: pairs of images as a person sees them, ten a sheet, with a line of text below each and nothing drawn
+on them."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ class Cell:
 
 
 def thumbnail(images: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """(SIDE, 2 SIDE + GAP) uint8: both (H, W) images side by side, each stretched from its STRETCH percentiles, and with black around what is not square."""
+    """(SIDE, 2 SIDE + GAP) uint8: both (H, W) images side by side, each stretched from its STRETCH percentiles, and
+    with black around what is not square."""
     pair = np.zeros((SIDE, 2 * SIDE + GAP), np.uint8)
     for i, image in enumerate(images):
         scale = SIDE / max(image.shape)
@@ -49,7 +51,8 @@ def sheet(cells: Sequence[Cell]) -> np.ndarray:
     for k, cell in enumerate(cells):
         top, left = k // COLUMNS * h + MARGIN, k % COLUMNS * w + MARGIN
         canvas[top:top + SIDE, left:left + cell.thumbnail.shape[1]] = cell.thumbnail[..., None]
-        cv2.putText(canvas, caption(cell), (left, top + SIDE + CAPTION - 6), color=bgr(cell.colour), lineType=cv2.LINE_AA, **FONT)
+        cv2.putText(canvas, caption(cell), (left, top + SIDE + CAPTION - 6), color=bgr(cell.colour),
+                    lineType=cv2.LINE_AA, **FONT)
     return canvas
 
 
@@ -64,7 +67,8 @@ def caption(cell: Cell) -> str:
 
 
 def write(folder: Path, name: str, cells: Sequence[Cell]) -> list[Path]:
-    """Write the sheets NAME_0.png, NAME_1.png ... of these pairs into `folder`; those of an earlier run go. Raises OSError."""
+    """Write the sheets NAME_0.png, NAME_1.png ... of these pairs into `folder`; those of an earlier run go. Raises
+    OSError."""
     for old in folder.glob(f'{name}_[0-9]*.png'):
         old.unlink()
     files = []

@@ -1,7 +1,8 @@
-"""How fast a pair is answered: per stage and in total, in ms and in yardsticks timed in between, on scenes whose truth is known.
+"""How fast a pair is answered: per stage and in total, in ms and in yardsticks timed in between, on scenes whose truth
+is known.
 
-Images of all sizes show the same field at the same dose, as one detector read out at several resolutions does: the finer the pixels, the
-more of them the device covers, and the fewer photons each counts.
+Images of all sizes show the same field at the same dose, as one detector read out at several resolutions does: the
+finer the pixels, the more of them the device covers, and the fewer photons each counts.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from .score import WITHIN_MEAN, WITHIN_TIP
 
 FIELD = 0.3e-3 * 1024               # m at the isocentre, whatever the number of pixels
 PHOTONS = 1500.0 * 1024**2          # of the whole field
-MOMENT, STEP = 1.0, 1 / 30          # s: when the moving device is seen, and how long before that the pair before was taken, and the one before that
+MOMENT, STEP = 1.0, 1 / 30          # s: when the moving device is seen, and how long before that the pair before was
+                                    # taken, and the one before that
 STEP_NS = round(STEP * 1e9)
 COMPARED = 2                        # scenes for what takes seconds
 SPLINE, TRACKED, PAPER, FRANGI = 'spline, full', 'spline, tracked', 'paper', 'skimage frangi'
@@ -45,7 +47,8 @@ class Laps:
     right: int = 0                  # of these: answered, and within the truth's tolerance
     seconds: list[float] = field(default_factory=list)              # a pair
     yardsticks: list[float] = field(default_factory=list)           # s, just before each
-    cpu: list[float] = field(default_factory=list)                  # s of all threads; other work on the machine hardly shows in it
+    cpu: list[float] = field(default_factory=list)                  # s of all threads; other work on the machine hardly
+                                                                    # shows in it
     stages: dict[str, list[float]] = field(default_factory=dict)    # s
 
     def add(self, work: Callable[[], Reconstruction | None], blank: np.ndarray) -> None:
@@ -103,14 +106,15 @@ def sequences(size: int, count: int, seed: int) -> list[tuple[Scene, Scene, Scen
     views = biplane(arm=CArm(pixel_size_iso=FIELD / size, width=size, height=size))
     exposure = Exposure(photons=PHOTONS / size**2)
     runs = (xray_run(seed + k, views=views, exposure=exposure) for k in range(count))
-    return [tuple(run.scene(MOMENT - k * STEP, 2 - k) for k in (2, 1, 0)) for run in tqdm(runs, f'{size} px, rendering', count, unit='scene', disable=None, leave=False)]
+    return [tuple(run.scene(MOMENT - k * STEP, 2 - k) for k in (2, 1, 0))
+            for run in tqdm(runs, f'{size} px, rendering', count, unit='scene', disable=None, leave=False)]
 
 
 def measure(size: int, count: int, rounds: int, seed: int, compared: int = COMPARED) -> list[Laps]:
     """Laps of each way of working on scenes of one size; `compared` of them are given to what takes seconds.
 
-    A scene is timed where its answer is right, since a wrong answer's time means nothing; the others are counted. What the literal method answers
-    is checked too, but it is timed in any case: in front of anatomy it finds a rib.
+    A scene is timed where its answer is right, since a wrong answer's time means nothing; the others are counted. What
+    the literal method answers is checked too, but it is timed in any case: in front of anatomy it finds a rib.
     """
     cv2.setNumThreads(Config().input.threads)
     blank = np.random.default_rng(0).random((1024, 1024), np.float32)
@@ -119,10 +123,12 @@ def measure(size: int, count: int, rounds: int, seed: int, compared: int = COMPA
     given: dict[str, list] = {way: [(now, config_of(now), Prior()) for *_, now in moments] for way in (SPLINE, TRACKED)}
     for k, (*earlier, now) in enumerate(moments):
         before, last = (reconstruct(scene.frame, config_of(scene)).shape for scene in earlier)
-        given[TRACKED][k] = now, config_of(now), Prior(last, now.frame.stamp_ns - STEP_NS, before, now.frame.stamp_ns - 2 * STEP_NS)
+        given[TRACKED][k] = now, config_of(now), Prior(last, now.frame.stamp_ns - STEP_NS, before,
+                                                       now.frame.stamp_ns - 2 * STEP_NS)
     for laps in (full, tracked):
         given[laps.way] = [(now.frame, config, prior) for now, config, prior in given[laps.way]
-                           if (laps is full or prior.previous is not None) and is_right(reconstruct(now.frame, config, prior), now)]
+                           if (laps is full or prior.previous is not None)
+                           and is_right(reconstruct(now.frame, config, prior), now)]
         laps.right = len(given[laps.way])
     for _ in tqdm(range(rounds), f'{size} px, timing', unit='round', disable=None, leave=False):
         for both in zip_longest(given[SPLINE], given[TRACKED]):
@@ -152,27 +158,32 @@ def _frangi(images: tuple[np.ndarray, np.ndarray]) -> None:
 
 def table(found: list[Laps]) -> str:
     """A line a size and way of working, then one a stage, for a terminal."""
-    lines = [f'{"px":>5s}  {"what":15s} {"right":>7s} {"n":>5s}  {"ms: median":>10s} {"p95":>7s} {"p99":>7s}  {"Y: median":>9s} {"p95":>7s} {"p99":>7s}  '
-             f'{"CPU ms":>7s}  {"ns/px":>6s} {"growth":>6s}']
+    lines = [f'{"px":>5s}  {"what":15s} {"right":>7s} {"n":>5s}  {"ms: median":>10s} {"p95":>7s} {"p99":>7s}  '
+             f'{"Y: median":>9s} {"p95":>7s} {"p99":>7s}  {"CPU ms":>7s}  {"ns/px":>6s} {"growth":>6s}']
     for laps in found:
         right = f'{laps.right}/{laps.scenes}' if laps.scenes else '-'
-        lines.append(f'{laps.size:5d}  {laps.way:15s} {right:>7s} {len(laps.seconds):5d}  {_quantiles(laps.seconds, 1e-3)}  {_quantiles(laps.seconds, laps.unit, 9)}  '
+        lines.append(f'{laps.size:5d}  {laps.way:15s} {right:>7s} {len(laps.seconds):5d}  '
+                     f'{_quantiles(laps.seconds, 1e-3)}  {_quantiles(laps.seconds, laps.unit, 9)}  '
                      f'{median(laps.cpu) * 1e3:7.1f}  {laps.ns_per_pixel:6.1f} {growth(laps, found):6.2f}')
-    lines += ['', f'{"px":>5s}  {"stage":25s} {"n":>5s}  {"ms: median":>10s} {"p95":>7s} {"p99":>7s}  {"Y: median":>9s} {"p95":>7s} {"p99":>7s}']
+    lines += ['', f'{"px":>5s}  {"stage":25s} {"n":>5s}  {"ms: median":>10s} {"p95":>7s} {"p99":>7s}  '
+                  f'{"Y: median":>9s} {"p95":>7s} {"p99":>7s}']
     for laps in found:
         for stage, seconds in laps.stages.items():
-            lines.append(f'{laps.size:5d}  {f"{laps.way}: {stage}":25s} {len(seconds):5d}  {_quantiles(seconds, 1e-3)}  {_quantiles(seconds, laps.unit, 9)}')
+            lines.append(f'{laps.size:5d}  {f"{laps.way}: {stage}":25s} {len(seconds):5d}  '
+                         f'{_quantiles(seconds, 1e-3)}  {_quantiles(seconds, laps.unit, 9)}')
     return '\n'.join([*lines, '', *_legend(found)])
 
 
 def growth(laps: Laps, found: list[Laps]) -> float:
     """Cost per pixel, in yardsticks, as a multiple of the same way's at the smallest size that was timed."""
-    return laps.y_per_pixel / min((f for f in found if f.way == laps.way and f.seconds), key=lambda f: f.size, default=laps).y_per_pixel
+    return laps.y_per_pixel / min((f for f in found if f.way == laps.way and f.seconds), key=lambda f: f.size,
+                                  default=laps).y_per_pixel
 
 
 def plain(found: list[Laps]) -> list[dict]:
     """For JSON: everything, in s."""
-    return [{'size_px': f.size, 'way': f.way, 'scenes': f.scenes, 'right': f.right, 'seconds': f.seconds, 'yardsticks': f.yardsticks, 'cpu_seconds': f.cpu, 'stages': f.stages,
+    return [{'size_px': f.size, 'way': f.way, 'scenes': f.scenes, 'right': f.right, 'seconds': f.seconds,
+             'yardsticks': f.yardsticks, 'cpu_seconds': f.cpu, 'stages': f.stages,
              'median_y': median(f.seconds) / f.unit, 'p95_y': float(np.percentile(f.seconds, 95)) / f.unit,
              'ns_per_pixel': f.ns_per_pixel, 'growth': growth(f, found)} for f in found if f.seconds]
 
@@ -184,9 +195,13 @@ def _quantiles(seconds: list[float], unit: float, width: int = 10) -> str:
 
 def _legend(found: list[Laps]) -> list[str]:
     y = [lap for f in found for lap in f.yardsticks]
-    return [f'Y        cv2.GaussianBlur(float32 1024x1024, sigma 2) on two images, before every repeat: {np.median(y) * 1e3:.2f} ms (p95 {np.percentile(y, 95) * 1e3:.2f})',
-            f'right    scenes answered within {WITHIN_MEAN * 1e3:g} mm mean and {WITHIN_TIP * 1e3:g} mm at the tip: only these are timed (paper: all)',
-            f'sizes    the same field of {FIELD * 1e3:.0f} mm at the same dose, in finer pixels; ns/px: median over the pixels of both images',
+    return ['Y        cv2.GaussianBlur(float32 1024x1024, sigma 2) on two images, before every repeat: '
+            f'{np.median(y) * 1e3:.2f} ms (p95 {np.percentile(y, 95) * 1e3:.2f})',
+            f'right    scenes answered within {WITHIN_MEAN * 1e3:g} mm mean and {WITHIN_TIP * 1e3:g} mm at the tip: '
+            'only these are timed (paper: all)',
+            f'sizes    the same field of {FIELD * 1e3:.0f} mm at the same dose, in finer pixels; '
+            'ns/px: median over the pixels of both images',
             'CPU ms   median of all threads together, which other work on the machine hardly touches',
             'growth   cost per pixel, in Y, as a multiple of that at the smallest size',
-            f'machine  {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {cv2.getNumThreads()} threads of OpenCV {cv2.__version__}, NumPy {np.__version__}']
+            f'machine  {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {cv2.getNumThreads()} threads of OpenCV '
+            f'{cv2.__version__}, NumPy {np.__version__}']

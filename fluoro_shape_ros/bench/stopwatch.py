@@ -1,4 +1,5 @@
-"""The other end of the node's topics, with a clock: publishes pairs rendered beforehand, hears backbones and diagnostics, calls services."""
+"""The other end of the node's topics, with a clock: publishes pairs rendered beforehand, hears backbones and
+diagnostics, calls services."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ ON_DEMAND = {'backbone_points': PointCloud2, 'markers': MarkerArray, 'plane_a/ov
 
 
 class Probe(OwnNode):
-    """A context manager with a ROS context of its own, used by one thread: what comes is heard while it spins or streams.
+    """A context manager with a ROS context of its own, used by one thread: what comes is heard while it spins or
+    streams.
 
     `scenes` are played forth and back. Times are those of time.monotonic().
     """
@@ -56,7 +58,8 @@ class Probe(OwnNode):
         node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         self._services = [(node.create_client(Trigger, 'fluoro_shape/clear_mask'), Trigger.Request()),
                           (node.create_client(SetParameters, 'fluoro_shape/set_parameters'),
-                           SetParameters.Request(parameters=[Parameter('max_curvature', value=0.0).to_parameter_msg()]))]
+                           SetParameters.Request(parameters=[Parameter('max_curvature',
+                                                                       value=0.0).to_parameter_msg()]))]
         self._next_call = itertools.cycle(self._services)
         self._pairs = ping_pong([(scene, self._messages(scene)) for scene in self._scenes])
         self._tips: dict[int, np.ndarray] = {}      # of what is under way
@@ -93,13 +96,16 @@ class Probe(OwnNode):
         self._images[1].publish(images[1])
         return stamp
 
-    def stream(self, rate: float, seconds: float, calls: bool = False, stop: Callable[[], bool] = lambda: False) -> None:
-        """Publish `rate` pairs a second for so many seconds or until `stop()`, and hear what comes; with `calls` ask a service now and then."""
+    def stream(self, rate: float, seconds: float, calls: bool = False,
+               stop: Callable[[], bool] = lambda: False) -> None:
+        """Publish `rate` pairs a second for so many seconds or until `stop()`, and hear what comes; with `calls` ask a
+        service now and then."""
         start = due = time.monotonic()
         call = start + CALL_EVERY_S
         while due < start + seconds and not stop():
             self.publish()
-            due = max(due + 1 / rate, time.monotonic() - 1 / rate)      # one late pair may be caught up with, a burst may not
+            # one late pair may be caught up with, a burst may not
+            due = max(due + 1 / rate, time.monotonic() - 1 / rate)
             if calls and time.monotonic() > call:
                 call += CALL_EVERY_S
                 self._call()
@@ -120,12 +126,14 @@ class Probe(OwnNode):
 
     def _messages(self, scene: Scene) -> tuple[list[CameraInfo], list[Image]]:
         frame = scene.frame
-        return ([calibration_to_camera_info(calibration(view), 0, optical_frame(plane), ros_message) for plane, view in zip(PLANES, frame.views)],
-                [array_to_image(image, 0, optical_frame(plane), ros_message) for plane, image in zip(PLANES, frame.images)])
+        return ([calibration_to_camera_info(calibration(view), 0, optical_frame(plane), ros_message)
+                 for plane, view in zip(PLANES, frame.views)],
+                [array_to_image(image, 0, optical_frame(plane), ros_message)
+                 for plane, image in zip(PLANES, frame.images)])
 
     def _on_backbone(self, cdr: bytes) -> None:
         """A Path as it comes: to make Python objects of it takes rclpy longer than all the rest of its way."""
-        now, (seconds, ns) = time.monotonic(), struct.unpack_from('<iI', cdr, 4)    # after the encapsulation's four bytes
+        now, (seconds, ns) = time.monotonic(), struct.unpack_from('<iI', cdr, 4)  # after the encapsulation's four bytes
         stamp = seconds * 10**9 + ns
         self.answered[stamp] = now
         if stamp in self._tips:
@@ -135,8 +143,10 @@ class Probe(OwnNode):
                 del self._tips[older]
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
-        values = {status.name.rpartition(': ')[2]: {item.key: item.value for item in status.values} for status in msg.status}
+        values = {status.name.rpartition(': ')[2]: {item.key: item.value for item in status.values}
+                  for status in msg.status}
         if {'pairing', 'reconstruction'} <= set(values):
-            outcomes = {key.removeprefix('count '): int(value) for key, value in values['reconstruction'].items() if key.startswith('count ')}
+            outcomes = {key.removeprefix('count '): int(value) for key, value in values['reconstruction'].items()
+                        if key.startswith('count ')}
             refused = sum(count for name, count in outcomes.items() if name != Outcome.OK.value)
             self.reports.append((time.monotonic(), {'dropped': int(values['pairing']['dropped']), 'refused': refused}))

@@ -1,4 +1,5 @@
-"""The command `streams`: seeded runs of fluoroscopy through the pipeline, pair after pair, as the node would answer them."""
+"""The command `streams`: seeded runs of fluoroscopy through the pipeline, pair after pair, as the node would answer
+them."""
 
 from __future__ import annotations
 
@@ -70,22 +71,27 @@ def attempt(task: Task) -> Trial:
         pairs.append(answered(moment, config, memory, task.time_budget, stream))
         if task.pictures and PICTURES[task.picture](pairs[-1].answer):
             thumbnails[k] = sheets.thumbnail(moment.scene.frame.images)
-    kept = [list(thumbnails)[round(i)] for i in np.linspace(0, len(thumbnails) - 1, min(task.pictures, len(thumbnails)))]
+    kept = [list(thumbnails)[round(i)]
+            for i in np.linspace(0, len(thumbnails) - 1, min(task.pictures, len(thumbnails)))]
     return Trial(task, stream.said(), pairs, {k: thumbnails[k] for k in kept})
 
 
 def answered(moment: Moment, config: Config, memory: Memory, time_budget: float, stream: Stream) -> Pair:
-    """A pair through the pipeline and into the memory as the node's worker does it; with a `time_budget` in s it has until then."""
+    """A pair through the pipeline and into the memory as the node's worker does it; with a `time_budget` in s it has
+    until then."""
     frame = moment.scene.frame
     begin, begin_cpu = time.monotonic(), time.process_time()
     job = Job(frame.stamp_ns, frame.images, (None, None), config, memory.generation, begin)
-    result = reconstruct(frame, config, memory.prior(job, frame, _window(frame)), begin + time_budget if time_budget else None)
+    result = reconstruct(frame, config, memory.prior(job, frame, _window(frame)),
+                         begin + time_budget if time_budget else None)
     memory.remember(job, frame, result)
     seconds, cpu_s = time.monotonic() - begin, time.process_time() - begin_cpu
-    answer = dataclasses.replace(answer_of(Case(moment.scene, note=stream.said(), kind=stream.kind), result, moment.shown), cpu_s=cpu_s)
+    answer = dataclasses.replace(answer_of(Case(moment.scene, note=stream.said(), kind=stream.kind), result,
+                                           moment.shown), cpu_s=cpu_s)
     if result.shape is None:
         return Pair(answer, seconds)
-    return Pair(answer, seconds, result.shape.tip - moment.whole[-1], float(distance_to(result.shape.points, moment.whole).max()))
+    return Pair(answer, seconds, result.shape.tip - moment.whole[-1],
+                float(distance_to(result.shape.points, moment.whole).max()))
 
 
 def _take_mask(stream: Stream, memory: Memory, frames: int) -> None:
@@ -107,19 +113,27 @@ def add(commands) -> None:
     """The command's arguments."""
     text = 'runs of fluoroscopy, pair after pair: found, followed, lost and found again'
     epilog = 'kinds, in turn by seed:\n' + '\n'.join(f'  {name:12s} {of_kind}' for name, of_kind in KINDS.items())
-    command = commands.add_parser('streams', help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command = commands.add_parser('streams', help=text, description=f'{text[0].upper()}{text[1:]}.', epilog=epilog,
+                                  formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument('--streams', type=count, default=len(KINDS), metavar='N', help=f'(default: {len(KINDS)})')
     command.add_argument('--pairs', type=count, default=60, metavar='N', help='of each (default: 60)')
-    command.add_argument('--kinds', nargs='+', choices=list(KINDS), default=list(KINDS), metavar='KIND', help='(default: all)')
-    command.add_argument('--first-seed', type=natural, default=0, metavar='SEED', help='seeds count up from here (default: 0)')
-    command.add_argument('--ct', type=Path, metavar='FILE', help='instead of drawn anatomy: a folder with one DICOM series, or NPZ with hu (z, y, x) and spacing_m')
-    command.add_argument('--time-budget', type=_budget, default=0.0, metavar='S', help='how long a pair may take, as the node\'s parameter of this name; '
+    command.add_argument('--kinds', nargs='+', choices=list(KINDS), default=list(KINDS), metavar='KIND',
+                         help='(default: all)')
+    command.add_argument('--first-seed', type=natural, default=0, metavar='SEED',
+                         help='seeds count up from here (default: 0)')
+    command.add_argument('--ct', type=Path, metavar='FILE', help='instead of drawn anatomy: a folder with one DICOM '
+                                                                 'series, or NPZ with hu (z, y, x) and spacing_m')
+    command.add_argument('--time-budget', type=_budget, default=0.0, metavar='S',
+                         help='how long a pair may take, as the node\'s parameter of this name; '
                          '0: no limit, and the same answers on any machine (default: 0)')
     command.add_argument('--jobs', type=count, default=2, metavar='N', help='processes of one thread each (default: 2)')
     command.add_argument('--json', type=Path, metavar='FILE', help='write the rows and every pair there, in m and s')
-    command.add_argument('--pictures', type=natural, default=0, metavar='N', help='contact sheets of N pairs of each stream (default: 0)')
-    command.add_argument('--pictures-of', choices=PICTURES, default='all', help='of those that were answered, refused or wrong (default: all)')
-    command.add_argument('--sheets', type=Path, default=Path('sheets'), metavar='DIR', help='where they go (default: sheets)')
+    command.add_argument('--pictures', type=natural, default=0, metavar='N',
+                         help='contact sheets of N pairs of each stream (default: 0)')
+    command.add_argument('--pictures-of', choices=PICTURES, default='all',
+                         help='of those that were answered, refused or wrong (default: all)')
+    command.add_argument('--sheets', type=Path, default=Path('sheets'), metavar='DIR',
+                         help='where they go (default: sheets)')
     command.set_defaults(body=_body)
 
 
@@ -141,15 +155,20 @@ def _body(args, parser: argparse.ArgumentParser) -> int:
     if args.pictures:
         args.sheets.mkdir(parents=True, exist_ok=True)
     kinds = list(dict.fromkeys(args.kinds))
-    tasks = [Task(seed, kinds[seed % len(kinds)], args.pairs, args.ct and args.ct.absolute(), args.time_budget, args.pictures, args.pictures_of)
+    tasks = [Task(seed, kinds[seed % len(kinds)], args.pairs, args.ct and args.ct.absolute(), args.time_budget,
+                  args.pictures, args.pictures_of)
              for seed in range(args.first_seed, args.first_seed + args.streams)]
-    trials = sorted(tqdm(in_order(attempt, tasks, args.jobs), total=len(tasks), unit='stream', disable=None), key=lambda t: kinds.index(t.task.kind))
+    trials = sorted(tqdm(in_order(attempt, tasks, args.jobs), total=len(tasks), unit='stream', disable=None),
+                    key=lambda t: kinds.index(t.task.kind))
     rows = stream_figures.rows((t.task.kind, t.pairs) for t in trials)
     print(stream_figures.table(rows))
-    print(f'{"budget":9s} {f"{args.time_budget:g} s a pair" if args.time_budget else "none"}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}')
+    print(f'{"budget":9s} {f"{args.time_budget:g} s a pair" if args.time_budget else "none"}; {os.cpu_count()} cores, '
+          f'load {os.getloadavg()[0]:.1f}')
     if args.json:
-        given = {'command': args.command, 'first_seed': args.first_seed, 'ct': bool(args.ct), 'time_budget': args.time_budget}
-        args.json.write_text(json.dumps({**given, 'limits': LIMITS | {'jump_m': stream_figures.JUMP}, 'rows': {kind: dataclasses.asdict(r) for kind, r in rows.items()},
+        given = {'command': args.command, 'first_seed': args.first_seed, 'ct': bool(args.ct),
+                 'time_budget': args.time_budget}
+        args.json.write_text(json.dumps({**given, 'limits': LIMITS | {'jump_m': stream_figures.JUMP},
+                                         'rows': {kind: dataclasses.asdict(r) for kind, r in rows.items()},
                                          'streams': [plain(t) for t in trials]}, indent=1) + '\n')
     if args.pictures:
         write_sheets(trials, args.sheets)
@@ -158,28 +177,33 @@ def _body(args, parser: argparse.ArgumentParser) -> int:
 
 def write_sheets(trials: Sequence[Trial], folder: Path) -> list[Path]:
     """Contact sheets of each stream's thumbnails. Raises OSError."""
-    return [file for t in trials for file in sheets.write(folder, f'{t.task.kind}_{t.task.seed}', [_cell(t, k) for k in t.thumbnails])]
+    return [file for t in trials for file in sheets.write(folder, f'{t.task.kind}_{t.task.seed}',
+                                                          [_cell(t, k) for k in t.thumbnails])]
 
 
 def _cell(trial: Trial, k: int) -> sheets.Cell:
     a = trial.pairs[k].answer
     errors = f': mean {a.errors.mean * 1e3:.2f}, tip {a.errors.tip * 1e3:.2f} mm' if a.errors else ''
     colour = TIP if a.silent_failure else GOOD if a.right or not a.device else REJECTED
-    return sheets.Cell(trial.thumbnails[k], f'{trial.task.kind} {trial.task.seed}, pair {k}', trial.said, verdict(a) + errors, colour)
+    return sheets.Cell(trial.thumbnails[k], f'{trial.task.kind} {trial.task.seed}, pair {k}', trial.said,
+                       verdict(a) + errors, colour)
 
 
 def plain(trial: Trial) -> dict:
     """A stream for JSON, in m and s; what is not known is null."""
     pairs = trial.pairs
-    return {'seed': trial.task.seed, 'kind': trial.task.kind, 'said': trial.said, 'found': stream_figures.found(pairs), 'gap': stream_figures.gap(pairs),
-            'recoveries': stream_figures.recoveries(pairs), 'jumps': stream_figures.jumps(pairs), 'pairs': [_plain_pair(p) for p in pairs]}
+    return {'seed': trial.task.seed, 'kind': trial.task.kind, 'said': trial.said, 'found': stream_figures.found(pairs),
+            'gap': stream_figures.gap(pairs), 'recoveries': stream_figures.recoveries(pairs),
+            'jumps': stream_figures.jumps(pairs), 'pairs': [_plain_pair(p) for p in pairs]}
 
 
 def _plain_pair(p: Pair) -> dict:
     a = p.answer
-    return {'outcome': a.outcome.value, 'detail': a.detail, 'shown': a.device, 'right': a.right, 'silent_failure': a.silent_failure,
+    return {'outcome': a.outcome.value, 'detail': a.detail, 'shown': a.device, 'right': a.right,
+            'silent_failure': a.silent_failure,
             'confidence': _finite(a.confidence), 'errors_m': dataclasses.asdict(a.errors) if a.errors else None,
-            'tip_off_m': None if p.tip_off is None else p.tip_off.tolist(), 'stray_m': _finite(p.stray), 'seconds': p.seconds, 'cpu_s': _finite(a.cpu_s)}
+            'tip_off_m': None if p.tip_off is None else p.tip_off.tolist(), 'stray_m': _finite(p.stray),
+            'seconds': p.seconds, 'cpu_s': _finite(a.cpu_s)}
 
 
 def _finite(number: float) -> float | None:

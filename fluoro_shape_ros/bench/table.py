@@ -11,14 +11,15 @@ import numpy as np
 
 from .score import CHI2_95, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 
-ERRORS = {'mean': 'closest point', 'missed': 'and back', 'tip': 'tip', 'length': 'length', 'matched': 'matched'}     # of metrics.Errors: heading
+# of metrics.Errors: heading
+ERRORS = {'mean': 'closest point', 'missed': 'and back', 'tip': 'tip', 'length': 'length', 'matched': 'matched'}
 BOUND = 'bound'
 LEGEND = f"""\
 within   mean <= {WITHIN_MEAN * 1e3:g} mm and tip <= {WITHIN_TIP * 1e3:g} mm
 silent   published, yet mean > {SILENT_MEAN * 1e3:g} mm or tip > {SILENT_TIP * 1e3:g} mm, or no device was there
 honest   published, and the true tip lies in the reported 95 % ellipsoid: 95 % would be right; -: nothing reported
-errors   of what was published, mm: mean, 95th percentile, worst. Closest point: found curve to true one; and back: true one to found;
-         matched: at equal arc length from the tip
+errors   of what was published, mm: mean, 95th percentile, worst. Closest point: found curve to true one;
+         and back: true one to found; matched: at equal arc length from the tip
 bound    Cramer-Rao: expected closest-point distance, rms of tip and length"""
 
 
@@ -67,13 +68,15 @@ def row(answers: list[Answer]) -> Row:
     reasons = Counter(a.outcome.value for a in answers if not a.published)
     known = [a for a in answers if not np.isnan(a.surprise)]
     return Row(scenes=len(answers), device=any(a.device for a in answers), answered=sum(a.published for a in answers),
-               within=sum(a.within for a in answers), silent=sum(a.silent_failure for a in answers), reported=len(known),
+               within=sum(a.within for a in answers), silent=sum(a.silent_failure for a in answers),
+               reported=len(known),
                honest=sum(a.surprise <= CHI2_95 for a in known), rejections=dict(reasons.most_common()),
                errors=_stats([a.errors for a in answers if a.errors]))
 
 
 def table(found: dict[tuple[str, str], Row]) -> str:
-    """Two blocks of lines, a line a family and method: shares with reasons, then errors in mm; and what the columns mean."""
+    """Two blocks of lines, a line a family and method: shares with reasons, then errors in mm; and what the columns
+    mean."""
     return '\n'.join([*_shares(found), '', *_errors(found), '', LEGEND, '', *_totals(found)])
 
 
@@ -93,8 +96,8 @@ def _shares(found) -> list[str]:
         if method.strip() != BOUND:
             reasons = ', '.join(f'{n} {reason}' for reason, n in r.rejections.items())
             within = share(r.within, r.scenes) if r.device else '-'
-            lines.append(f'{family} {method} {r.scenes:6d} {share(r.answered, r.scenes):>8s} {within:>7s} {r.silent:6d} '
-                         f'{share(r.honest, r.reported):>7s}  {reasons}'.rstrip())
+            lines.append(f'{family} {method} {r.scenes:6d} {share(r.answered, r.scenes):>8s} {within:>7s} '
+                         f'{r.silent:6d} {share(r.honest, r.reported):>7s}  {reasons}'.rstrip())
     return lines
 
 

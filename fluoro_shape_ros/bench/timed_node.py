@@ -1,4 +1,5 @@
-"""fluoro_shape_node with a stopwatch: `timed_node FILE [ROS arguments]` writes a line `stamp_ns seconds` into FILE for each pair's reconstruction."""
+"""fluoro_shape_node with a stopwatch: `timed_node FILE [ROS arguments]` writes a line `stamp_ns seconds` into FILE for
+each pair's reconstruction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What the reconstruction does in a world as wide as the clinic: by family of scenes and kind of device, with what it costs and why it refuses."""
+"""What the reconstruction does in a world as wide as the clinic: by family of scenes and kind of device, with what it
+costs and why it refuses."""
 
 from __future__ import annotations
 
@@ -21,10 +22,12 @@ from .open_scenes import TEXT
 from .score import CHI2_95, RIGHT_MEAN_PX, RIGHT_TIP_PX, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Trial
 from .table import share
 
-LIMITS = {'right_mean_m': WITHIN_MEAN, 'right_tip_m': WITHIN_TIP, 'right_mean_px': RIGHT_MEAN_PX, 'right_tip_px': RIGHT_TIP_PX,
+LIMITS = {'right_mean_m': WITHIN_MEAN, 'right_tip_m': WITHIN_TIP, 'right_mean_px': RIGHT_MEAN_PX,
+          'right_tip_px': RIGHT_TIP_PX,
           'silent_mean_m': SILENT_MEAN, 'silent_tip_m': SILENT_TIP, 'honest_chi2': CHI2_95}
 LEGEND = f"""\
-right    of those with a device: mean <= {WITHIN_MEAN * 1e3:g} mm or {RIGHT_MEAN_PX:g} px there, and tip <= {WITHIN_TIP * 1e3:g} mm or {RIGHT_TIP_PX:g} px
+right    of those with a device: mean <= {WITHIN_MEAN * 1e3:g} mm or {RIGHT_MEAN_PX:g} px there,
+         and tip <= {WITHIN_TIP * 1e3:g} mm or {RIGHT_TIP_PX:g} px
 silent   published, yet mean > {SILENT_MEAN * 1e3:g} mm or tip > {SILENT_TIP * 1e3:g} mm, or no device was there
 honest   published, and the true tip lies in the reported 95 % ellipsoid: 95 % would be right; -: nothing reported
 CPU      s a pair of all threads of a process whose libraries have one thread each: median and worst"""
@@ -101,9 +104,11 @@ def rows(trials: Iterable[Trial]) -> dict[tuple[str, str, str], Row]:
 def row(answers: Sequence[Answer]) -> Row:
     """What the answers of one method come to."""
     reported = [a for a in answers if not math.isnan(a.surprise)]
-    return Row(scenes=len(answers), shown=sum(a.device for a in answers), answered=sum(a.published for a in answers), right=sum(a.right for a in answers),
-               silent=sum(a.silent_failure for a in answers), reported=len(reported), honest=sum(a.surprise <= CHI2_95 for a in reported),
-               cpu_answered=_cost([a.cpu_s for a in answers if a.published]), cpu_refused=_cost([a.cpu_s for a in answers if not a.published]),
+    return Row(scenes=len(answers), shown=sum(a.device for a in answers), answered=sum(a.published for a in answers),
+               right=sum(a.right for a in answers), silent=sum(a.silent_failure for a in answers),
+               reported=len(reported), honest=sum(a.surprise <= CHI2_95 for a in reported),
+               cpu_answered=_cost([a.cpu_s for a in answers if a.published]),
+               cpu_refused=_cost([a.cpu_s for a in answers if not a.published]),
                rejections=dict(Counter(a.outcome.value for a in answers if not a.published).most_common()))
 
 
@@ -111,8 +116,10 @@ def table(trials: Sequence[Trial]) -> str:
     """A line a family, method and kind for a terminal, what the columns mean, and a total of each method."""
     found = rows(trials)
     width = max(12, *(len(family) + 2 for family, _, _ in found), *(len(kind) + 4 for _, _, kind in found))
-    columns = f'{"scenes":>6s} {"answered":>8s} {"right":>6s} {"silent":>6s} {"honest":>6s}' + 2 * f'  {"median":>6s} {"worst":>6s}'
-    lines = [f'{"":{width + 7}s} {"":36s}  {"CPU answered":>13s}  {"CPU refused":>13s}', f'{"":{width + 7}s} {columns}  not answered']
+    columns = (f'{"scenes":>6s} {"answered":>8s} {"right":>6s} {"silent":>6s} {"honest":>6s}'
+               + 2 * f'  {"median":>6s} {"worst":>6s}')
+    lines = [f'{"":{width + 7}s} {"":36s}  {"CPU answered":>13s}  {"CPU refused":>13s}',
+             f'{"":{width + 7}s} {columns}  not answered']
     before = None
     for (family, method, kind), r in found.items():
         name = f'  {kind}' if kind else family if family != before else ''
@@ -129,13 +136,16 @@ def plain(trials: Sequence[Trial]) -> dict[str, dict]:
 def plain_trial(trial: Trial) -> dict:
     """A trial for JSON, in m and s; what is not known is null."""
     first = next(iter(trial.answers.values()))
-    return {'family': trial.task.family, 'seed': trial.task.seed, 'kind': first.kind, 'note': first.note, 'device': first.device, 'px_m': _finite(first.px_m),
+    return {'family': trial.task.family, 'seed': trial.task.seed, 'kind': first.kind, 'note': first.note,
+            'device': first.device, 'px_m': _finite(first.px_m),
             'answers': {method: _plain_answer(a) for method, a in trial.answers.items()}}
 
 
 def _plain_answer(a: Answer) -> dict:
-    return {'outcome': a.outcome.value, 'detail': a.detail, 'errors_m': dataclasses.asdict(a.errors) if a.errors else None, 'surprise': _finite(a.surprise),
-            'right': a.right, 'silent_failure': a.silent_failure, 'confidence': _finite(a.confidence), 'cpu_s': _finite(a.cpu_s)}
+    return {'outcome': a.outcome.value, 'detail': a.detail,
+            'errors_m': dataclasses.asdict(a.errors) if a.errors else None, 'surprise': _finite(a.surprise),
+            'right': a.right, 'silent_failure': a.silent_failure, 'confidence': _finite(a.confidence),
+            'cpu_s': _finite(a.cpu_s)}
 
 
 def _finite(number: float) -> float | None:
@@ -144,8 +154,10 @@ def _finite(number: float) -> float | None:
 
 def _cells(r: Row) -> str:
     reasons = ', '.join(f'{n} {reason}' for reason, n in r.rejections.items())
-    costs = '  '.join(f'{c.median:6.2f} {c.worst:6.2f}' if c else f'{"-":>6s} {"-":>6s}' for c in (r.cpu_answered, r.cpu_refused))
-    return f'{r.scenes:6d} {share(r.answered, r.scenes):>8s} {share(r.right, r.shown):>6s} {r.silent:6d} {share(r.honest, r.reported):>6s}  {costs}  {reasons}'
+    costs = '  '.join(f'{c.median:6.2f} {c.worst:6.2f}' if c else f'{"-":>6s} {"-":>6s}'
+                      for c in (r.cpu_answered, r.cpu_refused))
+    return (f'{r.scenes:6d} {share(r.answered, r.scenes):>8s} {share(r.right, r.shown):>6s} {r.silent:6d} '
+            f'{share(r.honest, r.reported):>6s}  {costs}  {reasons}')
 
 
 def _totals(trials: Sequence[Trial]) -> list[str]:
@@ -156,8 +168,9 @@ def _totals(trials: Sequence[Trial]) -> list[str]:
     lines = []
     for method, answers in by_method.items():
         r, cost = row(answers), _cost([a.cpu_s for a in answers])
-        lines.append(f'{method}: {r.right} of {r.shown} devices right ({share(r.right, r.shown)}), {r.silent} silent failures in {r.scenes} scenes '
-                     f'({100 * r.silent / r.scenes:.1f} %), CPU {cost.median:.2f} s a pair, {cost.worst:.2f} s at worst')
+        lines.append(f'{method}: {r.right} of {r.shown} devices right ({share(r.right, r.shown)}), '
+                     f'{r.silent} silent failures in {r.scenes} scenes ({100 * r.silent / r.scenes:.1f} %), '
+                     f'CPU {cost.median:.2f} s a pair, {cost.worst:.2f} s at worst')
     return lines
 
 
@@ -197,5 +210,6 @@ def cell(trial: Trial) -> sheets.Cell:
 
 def verdict(a: Answer) -> str:
     """What an answer is worth, in words."""
-    said = 'SILENT' if a.silent_failure else 'right' if a.right else 'published, not right' if a.published else f'refused: {a.outcome.value}'
+    said = ('SILENT' if a.silent_failure else 'right' if a.right else 'published, not right' if a.published
+            else f'refused: {a.outcome.value}')
     return said if a.device else f'no device, {said}'

@@ -11,7 +11,8 @@ from rclpy.signals import SignalHandlerOptions
 
 
 class OwnNode:
-    """A context manager: while it lasts there is a node NAME in a ROS context of its own; what comes is heard while it spins, by one thread."""
+    """A context manager: while it lasts there is a node NAME in a ROS context of its own; what comes is heard while it
+    spins, by one thread."""
 
     NAME: ClassVar[str]
 

@@ -59,7 +59,8 @@ class Score:
     def unanswered(self, now_ns: int) -> list[int]:
         """Stamps of the pairs that wait for more than PATIENCE_S, or were overtaken by an answered one."""
         newest = max(self._answered, default=0)
-        return sorted(s for s in self._truths if s not in self._answered and (s < newest or s < now_ns - PATIENCE_S * 1e9))
+        return sorted(s for s in self._truths if s not in self._answered
+                      and (s < newest or s < now_ns - PATIENCE_S * 1e9))
 
 
 def live_line(score: Score, now_ns: int, reason: str = '') -> str:
@@ -69,9 +70,10 @@ def live_line(score: Score, now_ns: int, reason: str = '') -> str:
     missed = len(score.unanswered(now_ns))
     line = f'{seconds:5.1f} s  {len(last):4.1f} results/s'
     if last:
-        line += (f'   latency {_median(a.latency_s for a in last) * 1e3:4.0f} ms   error: mean {_mm(a.errors.mean for a in last)} mm, '
-                 f'tip {_mm(a.errors.tip for a in last)} mm')
-    return f'{line}   answered {len(score.answers)} of {len(score.answers) + missed}{f"   [{reason}]" if reason else ""}'
+        line += (f'   latency {_median(a.latency_s for a in last) * 1e3:4.0f} ms   error: '
+                 f'mean {_mm(a.errors.mean for a in last)} mm, tip {_mm(a.errors.tip for a in last)} mm')
+    return (f'{line}   answered {len(score.answers)} of '
+            f'{len(score.answers) + missed}{f"   [{reason}]" if reason else ""}')
 
 
 def summary(score: Score, now_ns: int, not_answered: dict[str, int]) -> list[str]:
@@ -82,12 +84,15 @@ def summary(score: Score, now_ns: int, not_answered: dict[str, int]) -> list[str
         span = (answers[-1].stamp_ns - answers[0].stamp_ns) * 1e-9
         if span > 0:
             lines[0] += f', {(len(answers) - 1) / span:.1f} a second'
-        lines.append(f'latency     median {_median(a.latency_s for a in answers) * 1e3:.0f} ms, worst {max(a.latency_s for a in answers) * 1e3:.0f} ms')
+        lines.append(f'latency     median {_median(a.latency_s for a in answers) * 1e3:.0f} ms, '
+                     f'worst {max(a.latency_s for a in answers) * 1e3:.0f} ms')
         for label, name in (('mean error', 'mean'), ('tip error', 'tip')):
             values = [getattr(a.errors, name) for a in answers]
-            lines.append(f'{label:11s} median {_mm(values)} mm, 95th percentile {np.percentile(values, 95) * 1e3:.2f} mm, worst {max(values) * 1e3:.2f} mm')
+            lines.append(f'{label:11s} median {_mm(values)} mm, 95th percentile {np.percentile(values, 95) * 1e3:.2f} '
+                         f'mm, worst {max(values) * 1e3:.2f} mm')
     if not_answered:
-        lines.append('no answer   ' + ', '.join(f'{name} {count}' for name, count in sorted(not_answered.items(), key=lambda item: -item[1])))
+        lines.append('no answer   ' + ', '.join(f'{name} {count}' for name, count in sorted(not_answered.items(),
+                                                                                            key=lambda item: -item[1])))
     return lines
 
 
@@ -95,7 +100,8 @@ def headline(score: Score, now_ns: int) -> str:
     """The summary in one line, of a score with answers."""
     answers = score.answers
     return (f'{len(answers)} of {len(answers) + len(score.unanswered(now_ns))} pairs answered, '
-            f'mean error {_mm(a.errors.mean for a in answers)} mm, tip error {_mm(a.errors.tip for a in answers)} mm (medians)')
+            f'mean error {_mm(a.errors.mean for a in answers)} mm, tip error {_mm(a.errors.tip for a in answers)} '
+            'mm (medians)')
 
 
 def _median(values: Iterable[float]) -> float:

@@ -38,20 +38,24 @@ def _seen(axes, run: Run, moved: Plant) -> None:
     frame = moved.scene(run.record.joints[now], 0, now).frame
     height, width = frame.images[0].shape
     axes.imshow(frame.images[0], cmap='gray', aspect='equal')
-    for points, style in ((run.record.target, dict(color=MISS, lw=2)), (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=2))):
+    for points, style in ((run.record.target, dict(color=MISS, lw=2)),
+                          (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=2))):
         axes.plot(*project(frame.views[0].P, _between(points, 0, now)).T, **style)
-    axes.set(xlim=(0.15 * width, 0.85 * width), ylim=(0.95 * height, 0.05 * height), xticks=[], yticks=[], title='plane A')
+    axes.set(xlim=(0.15 * width, 0.85 * width), ylim=(0.95 * height, 0.05 * height), xticks=[], yticks=[],
+             title='plane A')
 
 
 def _path(axes, run: Run) -> None:
     """Along the square, seen as plane A sees it; without a square all of the run."""
     start, stop = run.square or (min(run.record.target), max(run.record.target) + 1)
-    for points, style in ((run.record.target, dict(color=MISS, lw=3, label='target')), (run.record.true, dict(color=TRUTH, lw=1.2, label='true tip')),
+    for points, style in ((run.record.target, dict(color=MISS, lw=3, label='target')),
+                          (run.record.true, dict(color=TRUTH, lw=1.2, label='true tip')),
                           (run.record.measured, dict(color=FOUND, ls='', marker='.', ms=4, label='measured tip'))):
         axes.plot(*_between(points, start, stop)[:, ACROSS_A].T * 1e3, **style)
     # a single wrong measurement shows in the errors, and need not shrink the path
     x, z = _between(run.record.true, start, stop)[:, ACROSS_A].T * 1e3
-    axes.set(xlim=(x.max() + 1.5, x.min() - 1.5), ylim=(z.min() - 1.5, z.max() + 1.5))     # in plane A's image x runs to the left, z up
+    # in plane A's image x runs to the left, z up
+    axes.set(xlim=(x.max() + 1.5, x.min() - 1.5), ylim=(z.min() - 1.5, z.max() + 1.5))
     axes.set(aspect='equal', xlabel='x (mm)', ylabel='z (mm)', title='the tip, as plane A sees it')
     axes.grid(True)
     axes.legend(loc='center', bbox_to_anchor=(0.38, 0.32), fontsize=8)
@@ -68,7 +72,8 @@ def _errors(axes, run: Run) -> None:
     begins = [(t - start) * 1e-9 for t in run.ends]
     for k, miss in enumerate(run.open_loop):
         span = begins[len(begins) - len(run.open_loop) + k - 1] if len(begins) > len(run.open_loop) or k else 0.0
-        axes.plot([span, begins[len(begins) - len(run.open_loop) + k]], [1e3 * miss] * 2, color=MISS, lw=2, ls='--', label=None if k else 'without the loop')
+        axes.plot([span, begins[len(begins) - len(run.open_loop) + k]], [1e3 * miss] * 2, color=MISS, lw=2, ls='--',
+                  label=None if k else 'without the loop')
     if record.blackout:
         axes.axvspan(*((t - start) * 1e-9 for t in record.blackout), color='#8899aa', alpha=0.35, label='plane B blank')
     axes.axhline(0.3, color=TIP, lw=0.8, label='0.3 mm')

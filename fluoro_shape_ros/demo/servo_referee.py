@@ -1,4 +1,5 @@
-"""The servo demo's referee: says where the tip is to go, and keeps what the robot, the node and the controller did. Truth does not leave it."""
+"""The servo demo's referee: says where the tip is to go, and keeps what the robot, the node and the controller did.
+Truth does not leave it."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from .own_node import OwnNode
 
 @dataclass
 class Record:
-    """By stamp (ns): (3,) target, true and measured tip (m), (n,) joints; and s from a pair's way out to the command that it caused."""
+    """By stamp (ns): (3,) target, true and measured tip (m), (n,) joints; and s from a pair's way out to the command
+    that it caused."""
 
     target: dict[int, np.ndarray] = field(default_factory=dict)
     true: dict[int, np.ndarray] = field(default_factory=dict)
@@ -46,9 +48,12 @@ class Referee(OwnNode):
 
     def _connect(self) -> None:
         self._targets = self._node.create_publisher(PointStamped, 'target', 1)
-        self._services = {name: self._node.create_client(Trigger, name) for name in ('fluoro_shape/capture_mask', 'insert', 'blackout')}
-        for kind, topic, callback in ((PointStamped, 'ground_truth/tip', self._on_truth), (PointStamped, 'tip', self._on_tip),
-                                      (JointState, 'joint_states', self._on_joints), (JointState, 'joint_command', self._on_command),
+        self._services = {name: self._node.create_client(Trigger, name)
+                          for name in ('fluoro_shape/capture_mask', 'insert', 'blackout')}
+        for kind, topic, callback in ((PointStamped, 'ground_truth/tip', self._on_truth),
+                                      (PointStamped, 'tip', self._on_tip),
+                                      (JointState, 'joint_states', self._on_joints),
+                                      (JointState, 'joint_command', self._on_command),
                                       (DiagnosticArray, '/diagnostics', self._on_diagnostics)):
             self._node.create_subscription(kind, topic, callback, 10)
 
@@ -80,7 +85,8 @@ class Referee(OwnNode):
             self._targets.publish(out)
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
-        self.masked |= any(value.key == 'mask' and value.value.startswith('in use') for status in msg.status for value in status.values)
+        self.masked |= any(value.key == 'mask' and value.value.startswith('in use') for status in msg.status
+                           for value in status.values)
 
     def _on_tip(self, msg: PointStamped) -> None:
         self.record.measured[stamp_ns(msg)] = _point(msg)

@@ -1,4 +1,5 @@
-"""The servo demo's robot, a process: driven by `joint_command`, it tells its joints and its model's prediction, and an X-ray system shows it."""
+"""The servo demo's robot, a process: driven by `joint_command`, it tells its joints and its model's prediction, and an
+X-ray system shows it."""
 
 from __future__ import annotations
 
@@ -35,9 +36,10 @@ BLIND = 1               # the plane that a blackout takes the device from
 class Robot(OwnNode):
     """Joints and X-ray system with a clock of their own, as a context manager.
 
-    The clock goes on by a pair time a pair: as fast as the wall's, but no pair goes out before the one before the last has been answered. So a
-    machine that is too slow slows the robot down, and does not decide how well it is controlled. At first it is not in the field, until the service
-    `insert` is called. The service `blackout` takes the device from a plane for BLACKOUT_S; its message are the stamps (ns) between which.
+    The clock goes on by a pair time a pair: as fast as the wall's, but no pair goes out before the one before the last
+    has been answered. So a machine that is too slow slows the robot down, and does not decide how well it is
+    controlled. At first it is not in the field, until the service `insert` is called. The service `blackout` takes the
+    device from a plane for BLACKOUT_S; its message are the stamps (ns) between which.
     """
 
     NAME = 'servo_robot'
@@ -53,7 +55,8 @@ class Robot(OwnNode):
         self._states = self._node.create_publisher(JointState, 'joint_states', 10)
         self._predictions = self._node.create_publisher(Path, 'predicted_backbone', 10)
         self._node.create_subscription(JointState, 'joint_command', self._on_command, 1)
-        self._node.create_subscription(MarkerArray, 'markers', self._on_markers, 10)     # they come for every pair, rejected or not
+        # they come for every pair, rejected or not
+        self._node.create_subscription(MarkerArray, 'markers', self._on_markers, 10)
         self._node.create_service(Trigger, 'blackout', self._on_blackout)
         self._node.create_service(Trigger, 'insert', self._on_insert)
 
@@ -70,7 +73,8 @@ class Robot(OwnNode):
 
     def _publish(self, xray: FluoroSim) -> None:
         now = self._stamps[-1]
-        self._states.publish(JointState(header=header(ros_message, now, ''), name=self._names, position=self._joints.tolist()))
+        self._states.publish(JointState(header=header(ros_message, now, ''), name=self._names,
+                                        position=self._joints.tolist()))
         if self._inserted:
             model = true_shape(plant.predicted(self._name, self._joints))
             self._predictions.publish(shape_to_path(model, now, FRAME_ID, ros_message))
@@ -80,10 +84,12 @@ class Robot(OwnNode):
         if not self._inserted:
             return self._plant.run.without_device(self._index)
         scene = self._plant.scene(self._joints, self._index, now)
-        return plant.without_device(self._plant, self._index, scene, BLIND) if self._dark[0] <= now < self._dark[1] else scene
+        return (plant.without_device(self._plant, self._index, scene, BLIND)
+                if self._dark[0] <= now < self._dark[1] else scene)
 
     def _serve(self, due: float, stop: threading.Event) -> None:
-        """Take commands until the next pair is due and the one before the last answered, the latter for at most PATIENCE_S."""
+        """Take commands until the next pair is due and the one before the last answered, the latter for at most
+        PATIENCE_S."""
         late = time.monotonic() + PATIENCE_S
         waiting = lambda: self._inserted and self._answered < self._stamps[-2:][0]      # noqa: E731
         while not stop.is_set() and ((now := time.monotonic()) < due or (waiting() and now < late)):
@@ -110,10 +116,12 @@ class Robot(OwnNode):
 
 
 def shown(args, seed: int) -> plant.Plant:
-    """The robot of a seed before the X-ray system that the command line asks for. Raises ToolError where there is none."""
+    """The robot of a seed before the X-ray system that the command line asks for. Raises ToolError where there is
+    none."""
     device, volume = load_device(args.device) if args.device else None, ct.load_ct(args.ct) if args.ct else None
     try:
-        return plant.plant(args.robot, seed, args.size, not args.no_anatomy, device=device, volume=volume, chain=imaging.SETTINGS[args.imaging])
+        return plant.plant(args.robot, seed, args.size, not args.no_anatomy, device=device, volume=volume,
+                           chain=imaging.SETTINGS[args.imaging])
     except ct.CtError as error:
         raise cli.ToolError(str(error)) from error
 

@@ -31,7 +31,8 @@ class Run:
     seed: int
     record: Record
     ends: tuple[int, ...]               # stamps at which the square, then each target was done with
-    open_loop: tuple[float, ...]        # for each target: how far the same robot misses it where its model alone places the joints
+    open_loop: tuple[float, ...]        # for each target: how far the same robot misses it where its model alone places
+                                        # the joints
     square: tuple[int, int] | None      # stamps between which the tip was driven along a square
     seconds: float                      # by the wall's clock
 
@@ -43,7 +44,8 @@ class Run:
     @property
     def tracking(self) -> float:
         """m rms, along the square; NaN without one."""
-        errors = [self.record.error(t) for t in self.record.target if self.square and self.square[0] <= t < self.square[1]]
+        errors = [self.record.error(t) for t in self.record.target
+                  if self.square and self.square[0] <= t < self.square[1]]
         return float(np.sqrt(np.mean(np.square(errors)))) if errors else float('nan')
 
     @property
@@ -51,7 +53,8 @@ class Run:
         return (max(self.record.true) - min(self.record.target)) * 1e-9
 
     def blackout(self, period: float) -> tuple[float, int] | None:
-        """How far the tip moved while the controller had to hold (m), and the number of pairs after the blackout up to the first measured one."""
+        """How far the tip moved while the controller had to hold (m), and the number of pairs after the blackout up to
+        the first measured one."""
         if self.record.blackout is None:
             return None
         start, stop = self.record.blackout
@@ -64,23 +67,28 @@ class Run:
 
 def commands(args, seed: int) -> dict[str, list[str]]:
     """The arguments of Python for each process."""
-    robot = ['--robot', args.robot, '--seed', str(seed), '--rate', str(args.rate), '--size', str(args.size), '--imaging', args.imaging]
+    robot = ['--robot', args.robot, '--seed', str(seed), '--rate', str(args.rate), '--size', str(args.size),
+             '--imaging', args.imaging]
     for name, value in (('--device', args.device), ('--ct', args.ct)):
         robot += [name, value] if value else []
     device = ['-p', f'device:={args.device}'] if args.device else []
     return {'node': ['-m', 'fluoro_shape_ros.node', '--ros-args', '-p', f'reference_frame:={FRAME_ID}', *device],
-            'robot': ['-m', 'fluoro_shape_ros.demo.servo_robot', *robot, *(['--no-anatomy'] if args.no_anatomy else [])],
-            'controller': [str(resource_path('example_controller.py')), '--ros-args', '-p', f'robot:={args.robot}', '-p', f'rate:={float(args.rate)}']}
+            'robot': ['-m', 'fluoro_shape_ros.demo.servo_robot', *robot,
+                      *(['--no-anatomy'] if args.no_anatomy else [])],
+            'controller': [str(resource_path('example_controller.py')), '--ros-args', '-p', f'robot:={args.robot}',
+                           '-p', f'rate:={float(args.rate)}']}
 
 
 def run(args, seed: int) -> Run:
-    """Start robot, node and controller, drive the tip along a square and to targets, end them. Raises ToolError where one of them fails or stalls."""
+    """Start robot, node and controller, drive the tip along a square and to targets, end them. Raises ToolError where
+    one of them fails or stalls."""
     begun = time.monotonic()
     what = plant.plant(args.robot, seed, args.size, with_anatomy=False)
     targets, joints = plant.goals(args.robot, seed, what, args.targets)
     open_loop = tuple(float(np.linalg.norm(what.backbone(q)[-1] - target)) for q, target in zip(joints, targets))
     with contextlib.ExitStack() as stack:
-        children = {name: stack.enter_context(child(arguments, args.out / f'{name}.log')) for name, arguments in commands(args, seed).items()}
+        children = {name: stack.enter_context(child(arguments, args.out / f'{name}.log'))
+                    for name, arguments in commands(args, seed).items()}
         course = Course(stack.enter_context(Referee()), children, args.out)
         course.until(course.referee.ready)
         if not args.no_mask:
@@ -114,7 +122,8 @@ class Course:
                 raise ToolError(f'no tip was measured for {STALL_S:g} s, see the logs in {self._out}')
 
     def along(self, path: np.ndarray, blackout: bool) -> tuple[int, int]:
-        """Move the target along the (N, 3) path at SPEED, with a blackout halfway if asked for; the stamps of start and end."""
+        """Move the target along the (N, 3) path at SPEED, with a blackout halfway if asked for; the stamps of start and
+        end."""
         start, length = self.referee.now, arc_length(path)[-1]
 
         def arrived() -> bool:

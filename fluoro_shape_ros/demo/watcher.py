@@ -44,8 +44,10 @@ class Watcher(OwnNode):
         """From now on take a snapshot of the first pair whose images, cameras, truth and result have all come."""
         self._parts = {}
         for plane in 'ab':
-            self._node.create_subscription(Image, f'plane_{plane}/image_raw', lambda msg, key=f'image {plane}': self._part(key, msg, msg), 5)
-            self._node.create_subscription(CameraInfo, f'plane_{plane}/camera_info', lambda msg, key=f'camera {plane}': self._part(key, msg, msg), 5)
+            self._node.create_subscription(Image, f'plane_{plane}/image_raw',
+                                           lambda msg, key=f'image {plane}': self._part(key, msg, msg), 5)
+            self._node.create_subscription(CameraInfo, f'plane_{plane}/camera_info',
+                                           lambda msg, key=f'camera {plane}': self._part(key, msg, msg), 5)
 
     def _on_truth(self, msg: Path) -> None:
         points = path_to_points(msg)
@@ -63,7 +65,8 @@ class Watcher(OwnNode):
             if status.name.endswith(': reconstruction'):
                 level = status.level[0] if isinstance(status.level, bytes) else status.level
                 self.reason = '' if level == OK or values.get('last outcome') == Outcome.OK.value else status.message
-                counts = {key.removeprefix('count '): int(value) for key, value in values.items() if key.startswith('count ')}
+                counts = {key.removeprefix('count '): int(value) for key, value in values.items()
+                          if key.startswith('count ')}
                 self.not_answered |= {name: count for name, count in counts.items() if name != Outcome.OK.value}
             elif status.name.endswith(': pairing') and values.get('dropped', '0') != '0':
                 self.not_answered['overtaken by a newer pair'] = int(values['dropped'])
@@ -75,7 +78,9 @@ class Watcher(OwnNode):
         parts[key] = value
         if len(parts) == 6:
             images = tuple(image_to_array(parts[f'image {plane}']) for plane in 'ab')
-            views = (camera_info_to_view(parts[f'camera {plane}'], plane, image.shape) for plane, image in zip('ab', images))
-            self.snapshot = Snapshot(images, tuple(view.P for view in views), parts['found'], np.asarray(parts['truth']))
+            views = (camera_info_to_view(parts[f'camera {plane}'], plane, image.shape)
+                     for plane, image in zip('ab', images))
+            self.snapshot = Snapshot(images, tuple(view.P for view in views), parts['found'],
+                                     np.asarray(parts['truth']))
         while len(self._parts) > KEPT:
             del self._parts[min(self._parts)]

@@ -16,7 +16,8 @@ from scipy.optimize import least_squares
 from ..geometry.cameras import depth, project, triangulate
 
 MIN_BEADS = 6           # 11 unknowns, 2 equations a bead (HZ 7.1)
-MIN_SPREAD = 0.02       # of the 11th singular value against the first: beads as flat as 1:40 leave errors of several px between them
+MIN_SPREAD = 0.02       # of the 11th singular value against the first: beads as flat as 1:40 leave errors of several px
+                        # between them
 FOLDS = 10              # parts of the beads that are left out of the fit in turn
 UNITS = {'m': 1.0, 'mm': 1e-3}
 EXTENT = 1e-3, 5.0      # m; a phantom that is smaller or larger has its positions in another unit than the table says
@@ -39,17 +40,19 @@ class Beads(NamedTuple):
 
 
 def read_beads(path: str) -> Beads:
-    """The beads in a table with the columns x_mm, y_mm, z_mm (or x_m, y_m, z_m), u_px and v_px. Raises CalibrationError and OSError, see read_points."""
+    """The beads in a table with the columns x_mm, y_mm, z_mm (or x_m, y_m, z_m), u_px and v_px. Raises CalibrationError
+    and OSError, see read_points."""
     (points,), pixels = read_points(path, [''], ['u_px', 'v_px'])
     return Beads(points, pixels)
 
 
 def read_points(path: str, prefixes: list[str], others: list[str]) -> tuple[list[np.ndarray], np.ndarray]:
-    """(N, 3) m of the columns PREFIXx_mm, ... (or PREFIXx_m, ...) for each prefix, and (N, M) of `others`, from a text table.
+    """(N, 3) m of the columns PREFIXx_mm, ... (or PREFIXx_m, ...) for each prefix, and (N, M) of `others`, from a text
+    table.
 
-    Commas, semicolons or tabs stand between the columns, in UTF-8, UTF-16 or Latin-1; where there are semicolons or tabs, a comma in a number is a
-    decimal point. Raises CalibrationError for missing columns, what is no number and positions in another unit than the columns say; OSError where
-    there is no such file.
+    Commas, semicolons or tabs stand between the columns, in UTF-8, UTF-16 or Latin-1; where there are semicolons or
+    tabs, a comma in a number is a decimal point. Raises CalibrationError for missing columns, what is no number and
+    positions in another unit than the columns say; OSError where there is no such file.
     """
     lines = [line for line in _text(path).splitlines() if line.strip() and not line.startswith(('#', 'sep='))]
     delimiter = max(';\t,', key=(lines[0] if lines else '').count)
@@ -59,12 +62,14 @@ def read_points(path: str, prefixes: list[str], others: list[str]) -> tuple[list
     unit = next((unit for unit in UNITS if set(columns[unit]) <= set(names)), None)
     if unit is None:
         vectors = [', '.join(f'{prefix}{axis}_{u}' for prefix in prefixes for axis in 'xyz') for u in ('mm', 'm')]
-        needed, found = f'{vectors[0]} (or {vectors[1]})' + (f', {" and ".join(others)}' if others else ''), ', '.join(rows[0] if rows else ())[:80] or 'an empty one'
+        needed, found = (f'{vectors[0]} (or {vectors[1]})' + (f', {" and ".join(others)}' if others else ''),
+                         ', '.join(rows[0] if rows else ())[:80] or 'an empty one')
         raise CalibrationError(f'{path}: needs a first line with {needed}, not {found}')
     values = []
     for number, row in enumerate(rows[1:], 1):
         try:
-            values.append([float(row[k] if delimiter == ',' else row[k].replace(',', '.')) for k in map(names.index, columns[unit])])
+            values.append([float(row[k] if delimiter == ',' else row[k].replace(',', '.'))
+                           for k in map(names.index, columns[unit])])
         except (IndexError, ValueError):
             raise CalibrationError(f'{path}: line {number + 1} has something that is no number') from None
     table = np.array(values).reshape(-1, len(columns[unit]))
@@ -100,22 +105,27 @@ def _check_unit(path: str, points: np.ndarray, unit: str, prefix: str) -> None:
     """Raises CalibrationError where positions would lie within a grain or a house."""
     extent = float(np.ptp(points, axis=0).max()) if len(points) > 1 and np.isfinite(points).all() else EXTENT[1]
     if not EXTENT[0] <= extent <= EXTENT[1]:
-        other, names = 'metres' if unit == 'mm' else 'millimetres', ', '.join(f'{prefix}{axis}_{unit}' for axis in 'xyz')
-        raise CalibrationError(f'{path}: the points lie within {extent / UNITS[unit]:.3g} {unit} by its columns {names}: are these {other}?')
+        other, names = 'metres' if unit == 'mm' else 'millimetres', ', '.join(f'{prefix}{axis}_{unit}'
+                                                                              for axis in 'xyz')
+        raise CalibrationError(f'{path}: the points lie within {extent / UNITS[unit]:.3g} {unit} by its columns '
+                               f'{names}: are these {other}?')
 
 
 # ---- the projection
 
 
 def projection_from_points(points: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
-    """(3, 4) P that maps (N, 3) points in m to (N, 2) pixels with the least squared reprojection error; |P[2, :3]| = 1, all points in front.
+    """(3, 4) P that maps (N, 3) points in m to (N, 2) pixels with the least squared reprojection error; |P[2, :3]| = 1,
+    all points in front.
 
-    The direct linear transformation on normalised coordinates (HZ 7.1), then Levenberg-Marquardt on the pixels (HZ 7.2); no distortion.
-    Raises CalibrationError for fewer than MIN_BEADS, values that are not finite, points (nearly) in one plane, and points on both sides of the source.
+    The direct linear transformation on normalised coordinates (HZ 7.1), then Levenberg-Marquardt on the pixels
+    (HZ 7.2); no distortion. Raises CalibrationError for fewer than MIN_BEADS, values that are not finite, points
+    (nearly) in one plane, and points on both sides of the source.
     """
     points, pixels_px = np.asarray(points, float), np.asarray(pixels_px, float)
     if len(points) != len(pixels_px) or len(points) < MIN_BEADS:
-        raise CalibrationError(f'{len(points)} beads and {len(pixels_px)} pixels: at least {MIN_BEADS} of both are needed')
+        raise CalibrationError(f'{len(points)} beads and {len(pixels_px)} pixels: '
+                               f'at least {MIN_BEADS} of both are needed')
     if not (np.isfinite(points).all() and np.isfinite(pixels_px).all()):
         raise CalibrationError('not all positions and pixels are finite')
     T, U = _normalising(points), _normalising(pixels_px)
@@ -124,7 +134,8 @@ def projection_from_points(points: np.ndarray, pixels_px: np.ndarray) -> np.ndar
     A = np.vstack([np.hstack([X, zero, -u[:, :1] * X]), np.hstack([zero, X, -u[:, 1:2] * X])])
     _, sizes, directions = np.linalg.svd(A)
     if sizes[10] < MIN_SPREAD * sizes[0]:
-        raise CalibrationError('the beads do not tell a projection: they lie (nearly) in one plane, or too few of them do not')
+        raise CalibrationError('the beads do not tell a projection: they lie (nearly) in one plane, '
+                               'or too few of them do not')
 
     def residuals(p):
         x = X @ p.reshape(3, 4).T
@@ -134,7 +145,8 @@ def projection_from_points(points: np.ndarray, pixels_px: np.ndarray) -> np.ndar
     P /= np.linalg.norm(P[2, :3])
     P *= np.sign(np.median(depth(P, points)))
     if (depth(P, points) <= 0).any():
-        raise CalibrationError('the best projection has beads on both sides of the X-ray source: beads and pixels do not belong together')
+        raise CalibrationError('the best projection has beads on both sides of the X-ray source: '
+                               'beads and pixels do not belong together')
     return P
 
 
@@ -161,8 +173,8 @@ def common(a: Beads, b: Beads) -> tuple[np.ndarray, np.ndarray]:
 def triangulated_errors(a: Beads, b: Beads, P: list[np.ndarray] | None = None) -> np.ndarray:
     """(M,) m between the beads that both tables have and where they are triangulated.
 
-    With the projections `P` of the planes, or, without, with those fitted to the beads of the other FOLDS - 1 parts: what to expect of a point
-    that was no bead. NaN where these are too few to fit.
+    With the projections `P` of the planes, or, without, with those fitted to the beads of the other FOLDS - 1 parts:
+    what to expect of a point that was no bead. NaN where these are too few to fit.
     """
     i, j = common(a, b)
     if P is not None:
@@ -171,15 +183,18 @@ def triangulated_errors(a: Beads, b: Beads, P: list[np.ndarray] | None = None) -
     for part in range(min(FOLDS, len(i))):
         out = fold == part
         try:
-            fits = [projection_from_points(np.delete(t.points, k[out], axis=0), np.delete(t.pixels_px, k[out], axis=0)) for t, k in ((a, i), (b, j))]
+            fits = [projection_from_points(np.delete(t.points, k[out], axis=0), np.delete(t.pixels_px, k[out], axis=0))
+                    for t, k in ((a, i), (b, j))]
         except CalibrationError:
             continue
-        errors[out] = np.linalg.norm(triangulate(fits[0], fits[1], a.pixels_px[i[out]], b.pixels_px[j[out]]) - a.points[i[out]], axis=1)
+        errors[out] = np.linalg.norm(triangulate(fits[0], fits[1], a.pixels_px[i[out]], b.pixels_px[j[out]])
+                                     - a.points[i[out]], axis=1)
     return errors
 
 
 def _normalising(points: np.ndarray) -> np.ndarray:
-    """(d + 1, d + 1) similarity that brings (N, d) points to the origin and to a distance of sqrt(d) on average (HZ 4.4.4)."""
+    """(d + 1, d + 1) similarity that brings (N, d) points to the origin and to a distance of sqrt(d) on average
+    (HZ 4.4.4)."""
     center, d = points.mean(axis=0), points.shape[1]
     scale = np.sqrt(d) / max(np.linalg.norm(points - center, axis=1).mean(), 1e-300)
     T = np.diag([*[scale] * d, 1.0])

@@ -1,7 +1,9 @@
-"""A part of a recorded bag as a bag of its own: all that its pairs need, and nothing that says whose it is but the images themselves.
+"""A part of a recorded bag as a bag of its own: all that its pairs need, and nothing that says whose it is but the
+images themselves.
 
-Only what a reconstruction reads is taken, under the node's own topic names. Times are moved so that no date is left, frames get other names where
-theirs do not look like such, and compressed images are written anew without what a file may say of itself.
+Only what a reconstruction reads is taken, under the node's own topic names. Times are moved so that no date is left,
+frames get other names where theirs do not look like such, and compressed images are written anew without what a file
+may say of itself.
 """
 
 from __future__ import annotations
@@ -30,8 +32,10 @@ from .offline import Topics
 from .recorded_tf import NAMES as TF
 from .recorded_tf import TF_TYPE
 
-BEGIN_NS = 100_000 * 10**9      # where the earliest image is moved to: a day after 1970, so that older poses and camera infos still lie before it
-IMAGE, COMPRESSED, INFO, PATH = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Path'
+# where the earliest image is moved to: a day after 1970, so that older poses and camera infos still lie before it
+BEGIN_NS = 100_000 * 10**9
+IMAGE, COMPRESSED, INFO, PATH = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage',
+                                 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Path')
 PREDICTION = '/predicted_backbone'
 FRAME = re.compile(r'[A-Za-z]\w{0,39}(/\w{1,39}){0,3}', re.ASCII)
 DIGITS = re.compile(r'\d{4}')   # dates and numbers of patients have as many
@@ -52,8 +56,10 @@ class Held:
 
 
 def renamed() -> Rename:
-    """Frame ids as they are where they look like names of frames, else renamed_frame_1, ...: a name with spaces, marks or many digits, or this user's or machine's."""
-    own = {word.lower() for name in (Path(os.path.expanduser('~')).name, platform.node()) for word in (name, name.partition('.')[0]) if word}
+    """Frame ids as they are where they look like names of frames, else renamed_frame_1, ...: a name with spaces, marks
+    or many digits, or this user's or machine's."""
+    own = {word.lower() for name in (Path(os.path.expanduser('~')).name, platform.node())
+           for word in (name, name.partition('.')[0]) if word}
     known: dict[str, str] = {}
 
     def name(frame_id: str) -> str:
@@ -74,9 +80,11 @@ def names_of(config: Config) -> Topics:
 
 
 def cut(bag, out, topics: Topics, config: Config, spans: list[Span], rename: Rename) -> tuple[int, int]:
-    """Copy the images in `spans` (ascending, apart) of a bag (of open_bag) and what holds for them into `out` (of create_bag), from BEGIN_NS on.
+    """Copy the images in `spans` (ascending, apart) of a bag (of open_bag) and what holds for them into `out`
+    (of create_bag), from BEGIN_NS on.
 
-    Returns by how many ns stamps and log times were moved back. `topics` are those of `bag`, `config` what they are replayed with.
+    Returns by how many ns stamps and log times were moved back. `topics` are those of `bag`, `config` what they are
+    replayed with.
     """
     names = names_of(config)
     images, infos = ({plane: topic for topic, plane in named.items()} for named in (names.images, names.infos))
@@ -85,10 +93,12 @@ def cut(bag, out, topics: Topics, config: Config, spans: list[Span], rename: Ren
     around = [(min(found), max(found)) for found in stamps if found]
     early = min((low for low, _ in around), default=BEGIN_NS) - BEGIN_NS
     first, last = (pick((log for found in times for log, _ in found), default=spans[0][0]) for pick in (min, max))
-    held = [*_cameras(bag, topics, infos, config, around), *_poses(bag, topics, config, around), *_predictions(bag, around)]
+    held = [*_cameras(bag, topics, infos, config, around), *_poses(bag, topics, config, around),
+            *_predictions(bag, around)]
     for topic in images.values():
         out.declare(topic, COMPRESSED if config.input.image_transport == 'compressed' else IMAGE)
-    for topic, kind in {**dict.fromkeys(infos.values(), INFO), **dict.fromkeys(names.tf, TF_TYPE), **{h.topic: PATH for h in held if h.topic == PREDICTION}}.items():
+    for topic, kind in {**dict.fromkeys(infos.values(), INFO), **dict.fromkeys(names.tf, TF_TYPE),
+                        **{h.topic: PATH for h in held if h.topic == PREDICTION}}.items():
         out.declare(topic, kind)
 
     def moved(header, static: bool = False):
@@ -98,14 +108,18 @@ def cut(bag, out, topics: Topics, config: Config, spans: list[Span], rename: Ren
 
     def written(h: Held):
         if h.topic == PREDICTION:
-            return replace(h.message, header=moved(h.message.header), poses=[replace(p, header=moved(p.header)) for p in h.message.poses])
+            return replace(h.message, header=moved(h.message.header),
+                           poses=[replace(p, header=moved(p.header)) for p in h.message.poses])
         if h.topic in names.infos:
-            return replace(h.message, header=moved(h.message.header), distortion_model=_plain(h.message.distortion_model))
-        child = replace(h.message, header=moved(h.message.header, h.topic == '/tf_static'), child_frame_id=rename(h.message.child_frame_id))
+            return replace(h.message, header=moved(h.message.header),
+                           distortion_model=_plain(h.message.distortion_model))
+        child = replace(h.message, header=moved(h.message.header, h.topic == '/tf_static'),
+                        child_frame_id=rename(h.message.child_frame_id))
         return out.new(TF_TYPE, transforms=[child])
 
     held = sorted((replace(h, log_ns=min(max(h.log_ns, first), last)) for h in held), key=lambda h: h.log_ns)
-    pictures = ((r.log_ns, images[topics.images[r.topic]], r) for span in spans for r in bag.messages(topics.images, *span))
+    pictures = ((r.log_ns, images[topics.images[r.topic]], r) for span in spans
+                for r in bag.messages(topics.images, *span))
     for log, topic, thing in heapq.merge(((h.log_ns, h.topic, h) for h in held), pictures, key=lambda entry: entry[0]):
         message = written(thing) if isinstance(thing, Held) else _picture(thing.message, moved(thing.message.header))
         out.write(topic, message, log - first + BEGIN_NS)
@@ -153,7 +167,8 @@ def _poses(bag, topics: Topics, config: Config, around: list[Span]) -> list[Held
                 found[child, parent, kind].clear()
             found[child, parent, kind].append(Held(stamp_ns(t), r.log_ns, f'/{kind}', t))
             parents.setdefault(child, set()).add(parent)
-    wanted = {config.input.reference_frame.lstrip('/'), *(r.message.header.frame_id.lstrip('/') for r in bag.messages(topics.infos))}
+    wanted = {config.input.reference_frame.lstrip('/'),
+              *(r.message.header.frame_id.lstrip('/') for r in bag.messages(topics.infos))}
     while more := {above for frame in wanted for above in parents.get(frame, ())} - wanted:
         wanted |= more
     return _needed({key: entries for key, entries in found.items() if key[0] in wanted}, around)
@@ -162,7 +177,8 @@ def _poses(bag, topics: Topics, config: Config, around: list[Span]) -> list[Held
 def _predictions(bag, around: list[Span]) -> list[Held]:
     """Of the topic of that name, in whatever namespace, if there is one."""
     topics = [topic for topic, kind in bag.types().items() if kind == PATH and f'/{topic}'.endswith(PREDICTION)]
-    return _needed({'': [Held(stamp_ns(r.message), r.log_ns, PREDICTION, r.message) for r in bag.messages(topics[:1])]}, around)
+    return _needed({'': [Held(stamp_ns(r.message), r.log_ns, PREDICTION, r.message) for r in bag.messages(topics[:1])]},
+                   around)
 
 
 def _needed(found: dict[Any, list[Held]], around: list[Span]) -> list[Held]:

@@ -1,4 +1,5 @@
-"""Decodes the first compressed frames of a DICOM file to standard output, one .npy after the other: `python -m ... FILE COUNT`.
+"""Decodes the first compressed frames of a DICOM file to standard output, one .npy after the other:
+`python -m ... FILE COUNT`.
 
 A process of its own, because decoders are C++: GDCM 3.2 ends its process on some damaged JPEGs.
 """
@@ -20,7 +21,8 @@ def main() -> int:
     from pydicom.encaps import encapsulate
     from pydicom.pixels import iter_pixels
 
-    out = SimpleNamespace(write=sys.stdout.buffer.write)    # of a file NumPy would ask where it stands; pipes stand nowhere
+    # of a file NumPy would ask where it stands; pipes stand nowhere
+    out = SimpleNamespace(write=sys.stdout.buffer.write)
     try:
         path = Path(sys.argv[1])
         header = read_header(path)

@@ -1,4 +1,5 @@
-"""Where the frames of a DICOM file are, and how many there are, whatever its header says of that. Needs pydicom (extra `dicom`)."""
+"""Where the frames of a DICOM file are, and how many there are, whatever its header says of that. Needs pydicom
+(extra `dicom`)."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ from pathlib import Path
 from .dicom_header import BadDicom, reading
 
 PIXEL_DATA = b'\xe0\x7f\x10\0'      # (7FE0,0010), little endian
-STARTS = b'\xff\xd8', b'\xff\x4f\xff\x51'   # of JPEG and JPEG-LS (SOI), of JPEG 2000 (SOC, SIZ): nothing inside a frame begins so
+# of JPEG and JPEG-LS (SOI), of JPEG 2000 (SOC, SIZ): nothing inside a frame begins so
+STARTS = b'\xff\xd8', b'\xff\x4f\xff\x51'
 UNDEFINED = 2**32 - 1
 
 Pieces = list[tuple[int, int]]      # of a frame: where in the file each begins, and how many bytes it has
@@ -20,11 +22,13 @@ def count_frames(path: Path, header) -> int:
         return len(compressed_pieces(path, header))
     begin, length = pixel_data(path, header)
     there = path.stat().st_size - begin
-    return (there if length == UNDEFINED else min(length, there)) // (int(header.Rows) * int(header.Columns) * int(header.BitsAllocated) // 8)
+    return ((there if length == UNDEFINED else min(length, there))
+            // (int(header.Rows) * int(header.Columns) * int(header.BitsAllocated) // 8))
 
 
 def pixel_data(path: Path, header) -> tuple[int, int]:
-    """Where the value of the pixel data begins in the file, and its length by the file's own account. Raises BadDicom."""
+    """Where the value of the pixel data begins in the file, and its length by the file's own account. Raises
+    BadDicom."""
     import pydicom
     from pydicom.tag import Tag
 
@@ -40,7 +44,8 @@ def pixel_data(path: Path, header) -> tuple[int, int]:
 
 
 def compressed_pieces(path: Path, header) -> list[Pieces]:
-    """The frames of a compressed file (PS3.5 A.4). Tables of offsets are not asked, which are often wrong or missing; empty fragments are none. Raises BadDicom."""
+    """The frames of a compressed file (PS3.5 A.4). Tables of offsets are not asked, which are often wrong or missing;
+    empty fragments are none. Raises BadDicom."""
     from pydicom.encaps import parse_basic_offsets, parse_fragments
 
     begin, _ = pixel_data(path, header)
@@ -76,6 +81,8 @@ def compressed_frames(path: Path, header, count: int) -> Iterator[bytes]:
 
 
 def check_whole(path: Path, header, count: int) -> None:
-    """Raises BadDicom where a compressed file ends in one of its first `count` frames: decoders fill up what is missing."""
-    if any(at + length > path.stat().st_size for frame in compressed_pieces(path, header)[:count] for at, length in frame):
+    """Raises BadDicom where a compressed file ends in one of its first `count` frames: decoders fill up what is
+    missing."""
+    if any(at + length > path.stat().st_size for frame in compressed_pieces(path, header)[:count]
+           for at, length in frame):
         raise BadDicom(f'{path}: truncated: it ends in its last frame')

@@ -1,7 +1,7 @@
 """The header of a DICOM XA file: which attributes are read, and what may be in them. Needs pydicom (extra `dicom`).
 
-What is read of a file are the attributes in KEYWORDS and the pixels: nothing that tells whose images they are, and no dates but for the
-differences of the frames' times.
+What is read of a file are the attributes in KEYWORDS and the pixels: nothing that tells whose images they are, and no
+dates but for the differences of the frames' times.
 """
 
 from __future__ import annotations
@@ -17,17 +17,21 @@ import numpy as np
 DEFLATED = '1.2.840.10008.1.2.1.99'
 MAX_SIDE = 8192             # px; no angiograph makes more
 MAX_RATIO = 1000            # of a run to its file; no compression of X-ray images with noise comes near
-SEQUENCES = ('ModalityLUTSequence', 'SharedFunctionalGroupsSequence', 'PerFrameFunctionalGroupsSequence')     # whose own values pydicom has not looked at yet
-KEYWORDS = ('SOPClassUID', 'ImageType', 'PlaneIdentification', 'Rows', 'Columns', 'NumberOfFrames', 'SamplesPerPixel', 'PhotometricInterpretation',
-            'PresentationLUTShape', 'BitsAllocated', 'BitsStored', 'HighBit', 'PixelRepresentation', 'PixelIntensityRelationship',
-            'DistanceSourceToDetector', 'DistanceSourceToPatient', 'EstimatedRadiographicMagnificationFactor', 'ImagerPixelSpacing', 'PixelSpacing',
-            'FieldOfViewShape', 'FieldOfViewDimensions', 'PositionerPrimaryAngle', 'PositionerSecondaryAngle', 'PositionerPrimaryAngleIncrement',
-            'PositionerSecondaryAngleIncrement', 'PatientOrientation', 'FrameIncrementPointer', 'FrameTime', 'FrameTimeVector', 'CineRate',
+# whose own values pydicom has not looked at yet
+SEQUENCES = ('ModalityLUTSequence', 'SharedFunctionalGroupsSequence', 'PerFrameFunctionalGroupsSequence')
+KEYWORDS = ('SOPClassUID', 'ImageType', 'PlaneIdentification', 'Rows', 'Columns', 'NumberOfFrames', 'SamplesPerPixel',
+            'PhotometricInterpretation', 'PresentationLUTShape', 'BitsAllocated', 'BitsStored', 'HighBit',
+            'PixelRepresentation', 'PixelIntensityRelationship',
+            'DistanceSourceToDetector', 'DistanceSourceToPatient', 'EstimatedRadiographicMagnificationFactor',
+            'ImagerPixelSpacing', 'PixelSpacing', 'FieldOfViewShape', 'FieldOfViewDimensions', 'PositionerPrimaryAngle',
+            'PositionerSecondaryAngle', 'PositionerPrimaryAngleIncrement', 'PositionerSecondaryAngleIncrement',
+            'PatientOrientation', 'FrameIncrementPointer', 'FrameTime', 'FrameTimeVector', 'CineRate',
             'RecommendedDisplayFrameRate', *SEQUENCES)
 
 
 class BadDicom(ValueError):
-    """A file that is no XA run that can be used; the message names it and tells why, without what else is in the file."""
+    """A file that is no XA run that can be used; the message names it and tells why, without what else is in the
+    file."""
 
 
 def one_line(text: str) -> str:
@@ -37,7 +41,8 @@ def one_line(text: str) -> str:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Makes whatever pydicom raises on a damaged file a BadDicom; nothing of ours belongs into the block, whose errors would be taken for the file's."""
+    """Makes whatever pydicom raises on a damaged file a BadDicom; nothing of ours belongs into the block, whose errors
+    would be taken for the file's."""
     try:
         yield
     except Exception as error:      # on a damaged file pydicom raises anything
@@ -58,10 +63,12 @@ def read_header(path: Path):
     if syntax is not None and syntax not in pydicom.uid.AllTransferSyntaxes:
         raise BadDicom(f'{path}: written in a transfer syntax that is not known')
     with reading(path, 'its header'):
-        header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=[Tag(keyword) for keyword in KEYWORDS], force=True)
+        header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=[Tag(keyword) for keyword in KEYWORDS],
+                                 force=True)
         if syntax is None:
             implicit, little = header.original_encoding
-            syntax = pydicom.uid.ImplicitVRLittleEndian if implicit else pydicom.uid.ExplicitVRLittleEndian if little else pydicom.uid.ExplicitVRBigEndian
+            syntax = (pydicom.uid.ImplicitVRLittleEndian if implicit else pydicom.uid.ExplicitVRLittleEndian if little
+                      else pydicom.uid.ExplicitVRBigEndian)
         header.file_meta = pydicom.dataset.FileMetaDataset()
         header.file_meta.TransferSyntaxUID = pydicom.uid.UID(syntax)        # which a damaged file may have as a text
     for keyword in KEYWORDS:
@@ -73,7 +80,8 @@ def read_header(path: Path):
 
 
 def _transfer_syntax(path: Path):
-    """How a file is written; None where it does not say, because it begins with its data set (PS3.10 7.1 asks for more, older archives do not)."""
+    """How a file is written; None where it does not say, because it begins with its data set (PS3.10 7.1 asks for more,
+    older archives do not)."""
     from pydicom.filereader import _read_file_meta_info, read_preamble  # the public one of these wants a preamble
 
     with path.open('rb') as file:
@@ -87,7 +95,8 @@ def _transfer_syntax(path: Path):
 
 
 def number(path: Path, header, keyword: str, low: float, high: float, default: float | None = None) -> float:
-    """The one value of an attribute. Raises BadDicom where it is missing and has no default, and where it is out of range."""
+    """The one value of an attribute. Raises BadDicom where it is missing and has no default, and where it is out of
+    range."""
     values = numbers(path, header, keyword)
     if not values:
         if default is None:
@@ -121,15 +130,21 @@ def check_pixels(path: Path, header, count: int) -> None:
     from pydicom.pixels import get_decoder
 
     rows, columns = (int(number(path, header, k, 1, MAX_SIDE)) for k in ('Rows', 'Columns'))
-    allocated, kind = int(number(path, header, 'BitsAllocated', 1, 64)), str(header.get('PhotometricInterpretation', ''))
+    allocated, kind = (int(number(path, header, 'BitsAllocated', 1, 64)),
+                       str(header.get('PhotometricInterpretation', '')))
     stored = int(number(path, header, 'BitsStored', 1, allocated, allocated))
     high = int(number(path, header, 'HighBit', stored - 1, allocated - 1, stored - 1))
-    if allocated not in (8, 16) or number(path, header, 'SamplesPerPixel', 1, 4, 1) != 1 or kind not in ('MONOCHROME1', 'MONOCHROME2'):
-        raise BadDicom(f'{path}: only grey pixels of 8 or 16 bits are read, not {one_line(kind)[:16] or "unknown ones"} of {allocated} ({stored} stored, the highest is {high})')
-    syntax, size, needed = header.file_meta.TransferSyntaxUID, path.stat().st_size, rows * columns * count * allocated // 8
+    if (allocated not in (8, 16) or number(path, header, 'SamplesPerPixel', 1, 4, 1) != 1
+            or kind not in ('MONOCHROME1', 'MONOCHROME2')):
+        raise BadDicom(f'{path}: only grey pixels of 8 or 16 bits are read, '
+                       f'not {one_line(kind)[:16] or "unknown ones"} of {allocated} '
+                       f'({stored} stored, the highest is {high})')
+    syntax, size, needed = (header.file_meta.TransferSyntaxUID, path.stat().st_size,
+                            rows * columns * count * allocated // 8)
     if not syntax.is_encapsulated:
         if needed > size:
-            raise BadDicom(f'{path}: truncated: {count} frames of {columns}x{rows} px need {needed} bytes, the file has {size}')
+            raise BadDicom(f'{path}: truncated: {count} frames of {columns}x{rows} px need {needed} bytes, '
+                           f'the file has {size}')
         return
     try:
         decoder = get_decoder(syntax)
@@ -141,4 +156,5 @@ def check_pixels(path: Path, header, count: int) -> None:
     if 8 * count > size:
         raise BadDicom(f'{path}: truncated: {count} compressed frames in {size} bytes')
     if needed > MAX_RATIO * size:
-        raise BadDicom(f'{path}: {count} frames of {columns}x{rows} px are more than {MAX_RATIO} times as large as the file')
+        raise BadDicom(f'{path}: {count} frames of {columns}x{rows} px are more than {MAX_RATIO} times as large '
+                       'as the file')

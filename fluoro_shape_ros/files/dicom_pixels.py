@@ -28,11 +28,11 @@ class Table:
 
 
 def pictures(run: XaRun) -> Iterator[np.ndarray]:
-    """The (H, W) uint8 or uint16 frames as stored: windows are for displays and not applied; MONOCHROME1, which is INVERSE by another name, is turned
-    over, so that the device is dark.
+    """The (H, W) uint8 or uint16 frames as stored: windows are for displays and not applied; MONOCHROME1, which is
+    INVERSE by another name, is turned over, so that the device is dark.
 
-    Values that are logarithms of the intensity (LOG) become intensities where the file has the table for it (Modality LUT), else they stay.
-    Raises BadDicom where a frame can't be decoded.
+    Values that are logarithms of the intensity (LOG) become intensities where the file has the table for it
+    (Modality LUT), else they stay. Raises BadDicom where a frame can't be decoded.
     """
     header, table, number = run.header, modality_table(run), 0
     full = 2 ** (table.bits if table else stored_bits(header)) - 1
@@ -60,11 +60,14 @@ def uncompressed(run: XaRun) -> Iterator[np.ndarray]:
 
 def decoded(run: XaRun) -> Iterator[np.ndarray]:
     """The frames of a compressed run, see dicom_decoder. Raises BadDicom."""
-    with tempfile.TemporaryFile() as said, subprocess.Popen([sys.executable, '-m', DECODER, str(run.path), str(run.count)], stdout=subprocess.PIPE, stderr=said) as child:
+    with tempfile.TemporaryFile() as said, subprocess.Popen([sys.executable, '-m', DECODER, str(run.path),
+                                                             str(run.count)], stdout=subprocess.PIPE,
+                                                            stderr=said) as child:
         number = 0
         try:
             while child.stdout.peek(1):     # type: ignore[attr-defined]
-                yield np.lib.format.read_array(SimpleNamespace(read=child.stdout.read), allow_pickle=False)     # see dicom_decoder
+                # see dicom_decoder
+                yield np.lib.format.read_array(SimpleNamespace(read=child.stdout.read), allow_pickle=False)
                 number += 1
         except (ValueError, EOFError):     # it ended in the middle of a frame
             pass
@@ -73,12 +76,14 @@ def decoded(run: XaRun) -> Iterator[np.ndarray]:
             code = child.wait()
         if code:
             said.seek(0)
-            why = one_line((said.read().decode(errors='replace').splitlines() or [''])[-1]) if code > 0 else 'its decoder crashed'
+            why = (one_line((said.read().decode(errors='replace').splitlines() or [''])[-1])
+                   if code > 0 else 'its decoder crashed')
             raise BadDicom(f'{run.path}: frame {number + 1} can\'t be decoded ({why})')
 
 
 def modality_table(run: XaRun) -> Table | None:
-    """The file's own table from logarithms to intensities; None where it has none, or values that are something else. Raises BadDicom."""
+    """The file's own table from logarithms to intensities; None where it has none, or values that are something else.
+    Raises BadDicom."""
     header = run.header
     if header.get('PixelIntensityRelationship') != 'LOG' or not header.get('ModalityLUTSequence'):
         return None
@@ -87,7 +92,8 @@ def modality_table(run: XaRun) -> Table | None:
         item = header.ModalityLUTSequence[0]
         descriptor, data = np.atleast_1d(item.LUTDescriptor), item.LUTData
         data = np.frombuffer(data, words) if isinstance(data, bytes) else np.atleast_1d(data)
-    if descriptor.shape != (3,) or descriptor.dtype.kind not in 'iu' or data.dtype.kind not in 'iu' or not 8 <= descriptor[2] <= 16:
+    if (descriptor.shape != (3,) or descriptor.dtype.kind not in 'iu' or data.dtype.kind not in 'iu'
+            or not 8 <= descriptor[2] <= 16):
         raise BadDicom(f'{run.path}: its Modality LUT is no table of 8 to 16 bits')
     entries, first, bits = descriptor.tolist()
     if len(data) != (entries or 2**16) or data.min() < 0 or data.max() >= 2**bits:
@@ -104,16 +110,19 @@ def stored_values(frame: np.ndarray, header) -> np.ndarray:
     """The unsigned values in the bits from HighBit down; signed ones are raised so that the lowest is 0."""
     bits, dtype = stored_bits(header), np.uint8 if int(header.BitsAllocated) == 8 else np.uint16
     shift = int(header.get('HighBit') or bits - 1) + 1 - bits
-    values = (frame.astype(frame.dtype.newbyteorder('='), copy=False).view(dtype) >> dtype(shift)) & dtype(2**bits - 1)     # type: ignore[operator]
+    values = (frame.astype(frame.dtype.newbyteorder('='), copy=False).view(dtype)    # type: ignore[operator]
+              >> dtype(shift)) & dtype(2**bits - 1)
     return values ^ dtype(2 ** (bits - 1)) if header.get('PixelRepresentation') else values
 
 
 def check_frames(run: XaRun) -> None:
-    """Raises BadDicom where a compressed frame says that it is larger than the file says: it would be unpacked to that size."""
+    """Raises BadDicom where a compressed frame says that it is larger than the file says: it would be unpacked to that
+    size."""
     from pydicom.uid import RLELossless
 
     declared = int(run.header.Columns), int(run.header.Rows), 1
-    if run.header.file_meta.TransferSyntaxUID == RLELossless or not run.header.file_meta.TransferSyntaxUID.is_encapsulated:
+    if (run.header.file_meta.TransferSyntaxUID == RLELossless
+            or not run.header.file_meta.TransferSyntaxUID.is_encapsulated):
         return      # which say nothing else
     for number, frame in enumerate(compressed_frames(run.path, run.header, run.count), 1):
         found = codestream_size(frame)
@@ -121,7 +130,8 @@ def check_frames(run: XaRun) -> None:
             raise BadDicom(f'{run.path}: frame {number} can\'t be decoded: it does not say how large it is')
         if found != declared:
             inside = f'{found[0]}x{found[1]} px' + (f' of {found[2]} colours' if found[2] != 1 else '')
-            raise BadDicom(f'{run.path}: frame {number} is {inside} inside, but {declared[0]}x{declared[1]} by the header')
+            raise BadDicom(f'{run.path}: frame {number} is {inside} inside, '
+                           f'but {declared[0]}x{declared[1]} by the header')
 
 
 def codestream_size(frame: bytes) -> tuple[int, int, int] | None:
@@ -132,7 +142,8 @@ def codestream_size(frame: bytes) -> tuple[int, int, int] | None:
     at = 2
     while frame[:2] == b'\xff\xd8' and at + 9 < len(frame) and frame[at] == 0xff:
         marker = frame[at + 1]
-        if marker == 0xf7 or (0xc0 <= marker <= 0xcf and marker not in (0xc4, 0xc8, 0xcc)):     # SOF (T.81 B.2.2, T.87 C.2.2)
+        # SOF (T.81 B.2.2, T.87 C.2.2)
+        if marker == 0xf7 or (0xc0 <= marker <= 0xcf and marker not in (0xc4, 0xc8, 0xcc)):
             return number(at + 7, 2), number(at + 5, 2), frame[at + 9]
         at += 1 if marker == 0xff else 2 + number(at + 2, 2)    # 0xff: filled up before a marker
     return None

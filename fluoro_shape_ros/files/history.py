@@ -1,4 +1,5 @@
-"""What is kept of a replay to be looked at afterwards: numbers of every pair, and all that was seen of as many pairs as there is room for."""
+"""What is kept of a replay to be looked at afterwards: numbers of every pair, and all that was seen of as many pairs as
+there is room for."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class Row:
     length: float = float('nan')            # m
     tip: tuple[float, float, float] = NONE  # m
     sigma: float = float('nan')             # of the tip in its worst direction, m
-    residual_px: tuple[float, float] = NONE[:2]     # median distance of the reprojected backbone to the centreline seen in plane A, B
+    residual_px: tuple[float, float] = NONE[:2]     # median distance of the reprojected backbone to the centreline seen
+                                                    # in plane A, B
     confidence: float = float('nan')        # of a rejected pair too
 
     @property
@@ -82,9 +84,11 @@ class History:
 def row_of(answer: Answer) -> Row:
     """The numbers of an answer."""
     result, shape = answer.result, answer.result.shape
-    row = Row(answer.job.stamp_ns, result.outcome.value, '' if result.outcome is Outcome.OK else result.detail, result.warnings, answer.seconds,
-              confidence=result.confidence)
+    row = Row(answer.job.stamp_ns, result.outcome.value, '' if result.outcome is Outcome.OK else result.detail,
+              result.warnings, answer.seconds, confidence=result.confidence)
     if shape is None:
         return row
-    residuals = tuple(float(np.median(column[~np.isnan(column)])) if not np.isnan(column).all() else float('nan') for column in shape.residuals_px.T)
-    return dataclasses.replace(row, length=shape.length, tip=tuple(shape.tip.tolist()), sigma=tip_sigma(shape), residual_px=residuals)
+    residuals = tuple(float(np.median(column[~np.isnan(column)])) if not np.isnan(column).all() else float('nan')
+                      for column in shape.residuals_px.T)
+    return dataclasses.replace(row, length=shape.length, tip=tuple(shape.tip.tolist()), sigma=tip_sigma(shape),
+                               residual_px=residuals)

@@ -1,4 +1,5 @@
-"""Many bags through the replay: each in a process of its own, so that none can stop another, and one table over all of them at the end."""
+"""Many bags through the replay: each in a process of its own, so that none can stop another, and one table over all of
+them at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ HEAD = ('bag', 'pairs', 'answered', 'refused', 'most often', 'or failed')
 
 
 def replay_all(args: argparse.Namespace) -> int:
-    """Replay `args.bags` into the folder `args.out`, `args.jobs` at a time; the exit code, 130 where it was interrupted. Raises ToolError where a bag failed."""
+    """Replay `args.bags` into the folder `args.out`, `args.jobs` at a time; the exit code, 130 where it was
+    interrupted. Raises ToolError where a bag failed."""
     names, out = names_of(args.bags), Path(args.out)
     out.mkdir(exist_ok=True)
     if args.scheduler:
@@ -40,7 +42,8 @@ def _in_processes(args: argparse.Namespace, names: list[str]) -> tuple[list[tupl
     interrupted = False
     running: set[subprocess.Popen] = set()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(args.jobs) as pool:
-        tasks = {pool.submit(_replay, args, bag, name, Path(folder) / f'{k}.json', running): k for k, (bag, name) in enumerate(zip(args.bags, names))}
+        tasks = {pool.submit(_replay, args, bag, name, Path(folder) / f'{k}.json', running): k
+                 for k, (bag, name) in enumerate(zip(args.bags, names))}
         try:
             for task in tqdm(as_completed(tasks), 'replaying', len(tasks), unit='bag', disable=None):
                 found[tasks[task]] = task.result()
@@ -58,12 +61,15 @@ def _in_processes(args: argparse.Namespace, names: list[str]) -> tuple[list[tupl
 
 
 def _on_cluster(args: argparse.Namespace, names: list[str]) -> tuple[list[tuple[dict, str]], bool]:
-    """The same by the workers of a Dask scheduler, which see the same folders. Raises ToolError where that does not work, see bench.jobs."""
+    """The same by the workers of a Dask scheduler, which see the same folders. Raises ToolError where that does not
+    work, see bench.jobs."""
     from ..jobs import in_order
 
     found: list[tuple[dict, str]] = [({}, 'not begun')] * len(names)
-    there = argparse.Namespace(**vars(args) | dict(out=str(Path(args.out).resolve()), params=args.params and str(Path(args.params).resolve())))
-    results = in_order(_replay_there, [(there, str(Path(bag).resolve()), name) for bag, name in zip(args.bags, names)], scheduler=args.scheduler)
+    there = argparse.Namespace(**vars(args) | dict(out=str(Path(args.out).resolve()),
+                                                   params=args.params and str(Path(args.params).resolve())))
+    results = in_order(_replay_there, [(there, str(Path(bag).resolve()), name) for bag, name in zip(args.bags, names)],
+                       scheduler=args.scheduler)
     try:
         for k, result in enumerate(tqdm(results, 'replaying', len(names), unit='bag', disable=None)):
             found[k] = result
@@ -79,7 +85,8 @@ def _replay_there(task: tuple[argparse.Namespace, str, str]) -> tuple[dict, str]
 
 
 def names_of(bags: list[str]) -> list[str]:
-    """A name for the results of each bag: its own, with as many of the folders around it as it takes to tell all apart. Raises ToolError for one given twice."""
+    """A name for the results of each bag: its own, with as many of the folders around it as it takes to tell all apart.
+    Raises ToolError for one given twice."""
     paths = [Path(bag).resolve() for bag in bags]
     for path in paths:
         if paths.count(path) > 1:
@@ -94,10 +101,12 @@ def names_of(bags: list[str]) -> list[str]:
 
 def _replay(args: argparse.Namespace, bag: str, name: str, summary: Path, running: set) -> tuple[dict, str]:
     """What the replay of a bag came to (see `replay.as_json`), and why it failed or ''."""
-    own = {file: str(Path(args.out) / f'{name}_{Path(getattr(args, file)).name}') for file in FILES if getattr(args, file)}
+    own = {file: str(Path(args.out) / f'{name}_{Path(getattr(args, file)).name}')
+           for file in FILES if getattr(args, file)}
     given = vars(args) | own | dict(bags=[bag], out=str(Path(args.out) / name), json=str(summary))
     # Ctrl-C at the terminal must reach it once, through us
-    with subprocess.Popen([sys.executable, '-m', __name__, json.dumps(given)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    with subprocess.Popen([sys.executable, '-m', __name__, json.dumps(given)], stdin=subprocess.DEVNULL,
+                          stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                           start_new_session=True) as process:
         running.add(process)
         _, errors = process.communicate()
@@ -120,9 +129,11 @@ def table(names: list[str], found: list[tuple[dict, str]]) -> str:
         total = [total[0] + pairs, total[1] + answered]
         often = max((o for o in outcomes if o != 'ok'), key=outcomes.get, default='')
         rows.append((name, str(pairs), str(answered), str(pairs - answered), often, failure))
-    rows.append(('all', str(total[0]), str(total[1]), str(total[0] - total[1]), '', f'{sum(bool(failure) for _, failure in found)} of {len(names)} failed'))
+    rows.append(('all', str(total[0]), str(total[1]), str(total[0] - total[1]), '',
+                 f'{sum(bool(failure) for _, failure in found)} of {len(names)} failed'))
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
-    return '\n'.join('  '.join(cell.rjust(width) if 0 < k < 4 else cell.ljust(width) for k, (cell, width) in enumerate(zip(row, widths))).rstrip() for row in rows)
+    return '\n'.join('  '.join(cell.rjust(width) if 0 < k < 4 else cell.ljust(width)
+                               for k, (cell, width) in enumerate(zip(row, widths))).rstrip() for row in rows)
 
 
 def main() -> int:

@@ -1,7 +1,8 @@
-"""A recorded bag through the pipeline: images into pairs, the cameras that hold for them, the mask, and one answer a pair.
+"""A recorded bag through the pipeline: images into pairs, the cameras that hold for them, the mask, and one answer a
+pair.
 
-The order is that of the bag and nothing depends on timing, so the same bag gives the same answers. Reading and decoding go on in a second
-thread, ahead of the reconstruction.
+The order is that of the bag and nothing depends on timing, so the same bag gives the same answers. Reading and decoding
+go on in a second thread, ahead of the reconstruction.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ Copy = Callable[[object, int], None]    # takes a Recorded and its stamp in ns
 
 @dataclass(frozen=True)
 class Topics:
-    """Where the images and camera infos of a bag are: absolute topic -> plane; and its tf messages, -> tf or tf_static."""
+    """Where the images and camera infos of a bag are: absolute topic -> plane; and its tf messages, -> tf or
+    tf_static."""
 
     images: dict[str, str]
     infos: dict[str, str]
@@ -65,13 +67,16 @@ class Summary:
     counts: Counts = field(default_factory=Counts)
     images: Counter = field(default_factory=Counter)        # by plane
     outcomes: Counter = field(default_factory=Counter)      # by name
-    reasons: Counter = field(default_factory=Counter)       # by name of the outcome and why, of pairs without a result; numbers left out
+    reasons: Counter = field(default_factory=Counter)       # by name of the outcome and why, of pairs without a result;
+                                                            # numbers left out
     warnings: Counter = field(default_factory=Counter)
     refused: dict[str, str] = field(default_factory=dict)   # plane -> why its last refused camera info was
-    frames: dict[str, tuple[str, str]] = field(default_factory=dict)    # plane -> frame_id of an image, and another one of the camera info that held for it
+    frames: dict[str, tuple[str, str]] = field(default_factory=dict)    # plane -> frame_id of an image, and another one
+                                                                        # of the camera info that held for it
     masked: int = 0                                         # pairs that made the mask
     calibration: Finding = Finding()                        # what the run says of the calibrations
-    bug: str = ''                                           # what went wrong in the first pair that ended in internal_error
+    bug: str = ''                                           # what went wrong in the first pair that ended in
+                                                            # internal_error
 
     def count(self, stamp: int, result: Reconstruction) -> None:
         """One more pair came to an end."""
@@ -108,15 +113,17 @@ class Answer:
 class Offline:
     """A bag (of open_bag) being replayed; `summary` is complete once all `answers` were taken.
 
-    `window` is the start and the duration in s. The pairs of the first `mask_s` of the bag are not answered: they make the mask of the
-    others. `copy` gets every image of the window and every camera info as it is read.
+    `window` is the start and the duration in s. The pairs of the first `mask_s` of the bag are not answered: they make
+    the mask of the others. `copy` gets every image of the window and every camera info as it is read.
     """
 
-    def __init__(self, bag, config: Config, topics: Topics, window: tuple[float, float] = (0.0, math.inf), mask_s: float = 0.0, copy: Copy | None = None):
+    def __init__(self, bag, config: Config, topics: Topics, window: tuple[float, float] = (0.0, math.inf),
+                 mask_s: float = 0.0, copy: Copy | None = None):
         self.summary = Summary()
         self._bag, self._config, self._topics, self._mask_s, self._copy = bag, config, topics, mask_s, copy
         self._span = span_ns(bag, window)
-        self._pairer, self._memory, self._watch = Pairer(round(config.input.sync_slop * 1e9)), Memory(), CalibrationWatch()
+        self._pairer, self._memory, self._watch = (Pairer(round(config.input.sync_slop * 1e9)), Memory(),
+                                                   CalibrationWatch())
         self._views = lru_cache(maxsize=8)(view_of)
         self._cameras: dict[str, list[tuple[int, Camera]]] = {}
         self._poses: RecordedPoses | None = None    # with geometry: tf
@@ -124,16 +131,19 @@ class Offline:
     def answers(self) -> Iterator[Answer]:
         """One answer a pair, in the order of the bag. Raises ToolError where no images pair."""
         cv2.setNumThreads(self._config.input.threads or -1)     # 0 would mean none for OpenCV
-        self._cameras = read_cameras(self._bag, self._config, self._topics.infos, self.summary, self._span[1], self._copy)
+        self._cameras = read_cameras(self._bag, self._config, self._topics.infos, self.summary, self._span[1],
+                                     self._copy)
         if self._config.input.geometry == 'tf':
             self._poses = read_poses(self._bag, self._topics.tf, self._copy)
         span, summary = self._span, self.summary
         if self._mask_s:
             until_ns = self._bag.start_ns + round(self._mask_s * 1e9)
             span = max(span[0], until_ns), span[1]
-            summary.masked = take_mask((job for job, _ in self._jobs('mask', (self._bag.start_ns, until_ns))), self._memory, self._views, self._poses)
+            summary.masked = take_mask((job for job, _ in self._jobs('mask', (self._bag.start_ns, until_ns))),
+                                       self._memory, self._views, self._poses)
             if not summary.masked:
-                raise ToolError(f'--mask {self._mask_s:g}: there is no usable pair in the first {self._mask_s:g} s of the bag')
+                raise ToolError(f'--mask {self._mask_s:g}: there is no usable pair in the first {self._mask_s:g} '
+                                's of the bag')
         for job, log_ns in self._jobs('replaying', span):
             begin = time.perf_counter()
             frame, result = answer(job, self._memory, self._views, self._poses)
@@ -144,7 +154,8 @@ class Offline:
             summary.warnings.update(doubts(job.config, NO_FRAMES, job.cameras))
             summary.counts = dataclasses.replace(self._pairer.counts)   # as far as it got, should it be interrupted
             yield Answer(job, frame, result, time.perf_counter() - begin, log_ns)
-        summary.counts = dataclasses.replace(self._pairer.counts, unpaired=self._pairer.counts.unpaired + self._pairer.waiting)
+        summary.counts = dataclasses.replace(self._pairer.counts,
+                                             unpaired=self._pairer.counts.unpaired + self._pairer.waiting)
         if not summary.outcomes:
             raise ToolError(self._nothing())
 
@@ -156,7 +167,8 @@ class Offline:
             pictures += itertools.islice(map(self._picture, self._bag.messages(topics, log_ns, log_ns + 1)), 1)
         if len(pictures) < 2:
             return None
-        frame = adapt(dataclasses.replace(given.job, images=tuple(p.pixels for p in pictures)), self._views, self._poses, Tally())
+        frame = adapt(dataclasses.replace(given.job, images=tuple(p.pixels for p in pictures)), self._views,
+                      self._poses, Tally())
         return frame if isinstance(frame, Frame) else None
 
     def _jobs(self, what: str, span: tuple[int, int]) -> Iterator[tuple[Job, tuple[int, int]]]:
@@ -173,7 +185,8 @@ class Offline:
     def _pairs(self, what: str, span: tuple[int, int]) -> Iterator[tuple[int, Picture, Picture]]:
         """Stamp of plane A in ns and the pictures of the pairs in a span of log times."""
         pairer = self._pairer
-        for picture in _with_progress(ahead(map(self._picture, self._bag.messages(self._topics.images, *span))), what, self._shown(span)):
+        for picture in _with_progress(ahead(map(self._picture, self._bag.messages(self._topics.images, *span))), what,
+                                      self._shown(span)):
             if self._copy and self._span[0] <= picture.log_ns < self._span[1]:
                 self._copy(picture.recorded, picture.stamp_ns)
             self.summary.images[picture.plane] += 1
@@ -193,7 +206,8 @@ class Offline:
         if self._poses is None:     # whose stamps are asked for with the poses
             with contextlib.suppress(BadImage):     # is named when its turn comes
                 pixels = decode(recorded.message)
-        return Picture(self._topics.images[recorded.topic], stamp_ns(recorded.message), recorded.log_ns, pixels, recorded)
+        return Picture(self._topics.images[recorded.topic], stamp_ns(recorded.message), recorded.log_ns,
+                       pixels, recorded)
 
     def _nothing(self) -> str:
         """Why there is no answer at all."""
@@ -212,7 +226,8 @@ def span_ns(bag, window: tuple[float, float]) -> tuple[int, int]:
 
 
 def ahead(items: Iterable, depth: int = AHEAD) -> Iterator:
-    """The items of an iterator, taken by a second thread up to `depth` ahead; what it raises is raised here, in its turn."""
+    """The items of an iterator, taken by a second thread up to `depth` ahead; what it raises is raised here, in its
+    turn."""
     items, end = iter(items), object()
     pool = ThreadPoolExecutor(1, 'reading')
     try:
@@ -233,9 +248,11 @@ def _with_progress(pictures: Iterable[Picture], what: str, span: tuple[int, int]
             bar.update(min(max((picture.log_ns - span[0]) / 1e9, bar.n), total) - bar.n)
 
 
-def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary, stop_ns: int = MAX_NS, copy: Copy | None = None
+def read_cameras(bag, config: Config, infos: dict[str, str], summary: Summary, stop_ns: int = MAX_NS,
+                 copy: Copy | None = None
                  ) -> dict[str, list[tuple[int, Camera]]]:
-    """Plane to the valid cameras of the bag up to a log time with their stamps, ascending; the others are noted in `summary`."""
+    """Plane to the valid cameras of the bag up to a log time with their stamps, ascending; the others are noted in
+    `summary`."""
     known = {plane: [] for plane in PLANES}
     for recorded in bag.messages(infos, None, min(stop_ns + LATE_NS, MAX_NS)):
         plane, stamp = infos[recorded.topic], stamp_ns(recorded.message)
@@ -275,7 +292,8 @@ def answer(job: Job, memory: Memory, views, lookup: Lookup | None = None) -> tup
         return None, frame
     try:
         result = reconstruct(frame, job.config, memory.prior(job, frame, image_window(job, frame)))
-    except Exception as error:  # the last line of defence: a pair must not take the other thousands with it; the tool ends with 1
+    except Exception as error:
+        # the last line of defence: a pair must not take the other thousands with it; the tool ends with 1
         return frame, Reconstruction(Outcome.INTERNAL_ERROR, f'{type(error).__name__}: {error}')
     memory.remember(job, frame, result)
     return frame, result

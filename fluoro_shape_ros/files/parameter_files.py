@@ -1,4 +1,5 @@
-"""Parameters from the command line and from ROS parameter files, read as ROS's own parser (rcl) reads them, but without ROS."""
+"""Parameters from the command line and from ROS parameter files, read as ROS's own parser (rcl) reads them, but without
+ROS."""
 
 from __future__ import annotations
 
@@ -12,20 +13,25 @@ from ..config import ConfigError, fields
 
 NODE = 'fluoro_shape'
 KEY = 'ros__parameters'
-TRUE, FALSE = ({form(word) for word in words for form in (str.lower, str.title, str.upper)} for words in (('y', 'yes', 'true', 'on'), ('n', 'no', 'false', 'off')))
+TRUE, FALSE = ({form(word) for word in words for form in (str.lower, str.title, str.upper)}
+               for words in (('y', 'yes', 'true', 'on'), ('n', 'no', 'false', 'off')))
 INTEGER = re.compile(r'[+-]?(0x[0-9a-f]+|0[0-7]*|[1-9][0-9]*)', re.ASCII | re.IGNORECASE)
-REAL = re.compile(r'[+-]?(0x[0-9a-f]+\.?[0-9a-f]*(p[+-]?\d+)?|(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|\.?inf|infinity|\.?nan)', re.ASCII | re.IGNORECASE)
+REAL = re.compile(r'[+-]?(0x[0-9a-f]+\.?[0-9a-f]*(p[+-]?\d+)?|(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|\.?inf|infinity|\.?nan)',
+                  re.ASCII | re.IGNORECASE)
 SECTION = re.compile(r'(/?(\w+|\*\*?))+', re.ASCII)
 LARGEST = 2**63         # of whole numbers; a larger one is real
 _FIELDS = {f.name: f for f in fields()}
-_OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_service')    # nothing that an offline tool could need
+# nothing that an offline tool could need
+_OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 
 
-def read_parameters(path: str | None = None, assignments: list[str] | tuple[str, ...] = (), say: Callable[[str], None] = lambda words: None) -> dict:
+def read_parameters(path: str | None = None, assignments: list[str] | tuple[str, ...] = (),
+                    say: Callable[[str], None] = lambda words: None) -> dict:
     """Parameter name to value, from a ROS parameter file and from 'name=value' texts (name:=value will do), which win.
 
     Names in the file that are no parameters, which may be other nodes', are left out; `say` gets a line about each.
-    Raises ConfigError for what is no parameter or no value, and OSError where there is no such file. Ranges are for Config to check.
+    Raises ConfigError for what is no parameter or no value, and OSError where there is no such file. Ranges are for
+    Config to check.
     """
     values = _read_file(path) if path else {}
     for name in [name for name in values if name not in _FIELDS]:
@@ -42,7 +48,8 @@ def read_parameters(path: str | None = None, assignments: list[str] | tuple[str,
 
 
 def _read_file(path: str) -> dict:
-    """The values for the node /fluoro_shape: of the sections that match it the one that begins later wins, whatever its name, as in rcl."""
+    """The values for the node /fluoro_shape: of the sections that match it the one that begins later wins, whatever its
+    name, as in rcl."""
     import yaml
 
     text = Path(path).read_text(errors='replace')
@@ -63,11 +70,13 @@ def _read_file(path: str) -> dict:
     if not own:
         found = f', but of {", ".join(sections)}' if sections else ''
         raise ConfigError(f'{path}: no {KEY} of {NODE} (nor of /**){found}')
-    return {name: _typed(name, value) for given in own for name, value in given.items() if name.partition('.')[0] not in _OF_EVERY_NODE}
+    return {name: _typed(name, value) for given in own for name, value in given.items()
+            if name.partition('.')[0] not in _OF_EVERY_NODE}
 
 
 def _sections(node, path: str, prefix: str = '') -> Iterator[tuple[str, dict]]:
-    """Name of a node, as it is written with its namespaces, and its values, for every section below a YAML mapping node."""
+    """Name of a node, as it is written with its namespaces, and its values, for every section below a YAML mapping
+    node."""
     closed = False
     for key, value in node.value:
         name, line = str(key.value), key.start_mark.line + 1
@@ -75,7 +84,8 @@ def _sections(node, path: str, prefix: str = '') -> Iterator[tuple[str, dict]]:
             raise ConfigError(f'{path}: {name} in line {line} stands beside {KEY}')
         if name.startswith(KEY):
             if not prefix or value.id != 'mapping':
-                raise ConfigError(f'{path}: {KEY} in line {line} needs the name of a node before it and parameters below it')
+                raise ConfigError(f'{path}: {KEY} in line {line} needs the name of a node before it and '
+                                  'parameters below it')
             yield prefix, dict(_parameters(value, path))
             closed = True
         elif value.id != 'mapping':
@@ -88,7 +98,8 @@ def _sections(node, path: str, prefix: str = '') -> Iterator[tuple[str, dict]]:
 
 def _matches(name: str) -> bool:
     """Whether a section is one of the node /fluoro_shape: ** stands for any namespaces, * for one name."""
-    pattern = f'/{name.lstrip("/")}'.replace('/**', r'(/\w+)+' if name.endswith('**') else r'(/\w+)*').replace('/*', r'/\w+')
+    pattern = f'/{name.lstrip("/")}'.replace('/**',
+                                             r'(/\w+)+' if name.endswith('**') else r'(/\w+)*').replace('/*', r'/\w+')
     return re.fullmatch(pattern, f'/{NODE}') is not None
 
 
@@ -103,7 +114,8 @@ def _parameters(node, path: str, prefix: str = '') -> Iterator[tuple[str, object
 
 
 def _value(node, what: str, mixed: bool = False):
-    """A scalar or a list of scalars, which have one type unless `mixed`; None for an empty list, which says nothing to ROS."""
+    """A scalar or a list of scalars, which have one type unless `mixed`; None for an empty list, which says nothing to
+    ROS."""
     if node.id == 'scalar':
         if not node.value and node.style is None:
             raise ConfigError(f'{what} has no value')
@@ -117,7 +129,8 @@ def _value(node, what: str, mixed: bool = False):
 
 
 def _scalar(node):
-    """What rcl takes a YAML scalar for: what is in quotes is text, and there are other words for numbers than YAML 1.1 has."""
+    """What rcl takes a YAML scalar for: what is in quotes is text, and there are other words for numbers than YAML 1.1
+    has."""
     text = node.value
     if node.style in ('"', "'"):
         return text

@@ -1,4 +1,5 @@
-"""Pictures of a reconstruction for people: X-ray images with the backbone on them, the 3-D curve against truth, errors over time.
+"""Pictures of a reconstruction for people: X-ray images with the backbone on them, the 3-D curve against truth, errors
+over time.
 
 matplotlib is imported when a picture is made; nothing here opens a window.
 """
@@ -18,8 +19,9 @@ from ..overlay import FOUND, TIP, free_corner, grey_levels
 
 GROUND, TEXT, GRID = '#12161c', '#d8dee6', '#39424e'
 TRUTH, MISSED = '#ffffff', '#ffb347'
-STYLE = {'figure.facecolor': GROUND, 'savefig.facecolor': GROUND, 'axes.facecolor': GROUND, 'axes.edgecolor': GRID, 'axes.labelcolor': TEXT, 'text.color': TEXT,
-         'xtick.color': TEXT, 'ytick.color': TEXT, 'grid.color': GRID, 'grid.linewidth': 0.6, 'legend.facecolor': GROUND, 'legend.edgecolor': GRID}
+STYLE = {'figure.facecolor': GROUND, 'savefig.facecolor': GROUND, 'axes.facecolor': GROUND, 'axes.edgecolor': GRID,
+         'axes.labelcolor': TEXT, 'text.color': TEXT, 'xtick.color': TEXT, 'ytick.color': TEXT, 'grid.color': GRID,
+         'grid.linewidth': 0.6, 'legend.facecolor': GROUND, 'legend.edgecolor': GRID}
 NAMES = ('overlay_a', 'overlay_b', 'backbone', 'demo', 'errors')
 MARGIN_PX = 60          # around the backbone in an overlay
 INSET_HALF_PX = 24      # half the side of the magnified region around the tip
@@ -48,7 +50,8 @@ class History:
 
 
 def clear(out: Path) -> None:
-    """Make the folder `out` and remove the pictures of an earlier run, so that nothing old looks new. Raises OSError where it can't be written."""
+    """Make the folder `out` and remove the pictures of an earlier run, so that nothing old looks new. Raises OSError
+    where it can't be written."""
     out.mkdir(parents=True, exist_ok=True)
     for name in NAMES:
         (out / f'{name}.png').unlink(missing_ok=True)
@@ -72,7 +75,8 @@ def save(out: Path, snapshot: Snapshot | None, history: History, caption: str) -
     if snapshot is not None:
         for i, plane in enumerate('ab'):
             sheet(f'overlay_{plane}', (9, 9), lambda f, i=i: overlay(f.add_axes((0, 0, 1, 1)), snapshot, i))
-        sheet('backbone', (9, 8), lambda f: backbone(f.add_axes((0.0, 0.11, 0.98, 0.88), projection='3d'), f.add_axes((0.25, 0.07, 0.5, 0.02)), snapshot))
+        sheet('backbone', (9, 8), lambda f: backbone(f.add_axes((0.0, 0.11, 0.98, 0.88), projection='3d'),
+                                                     f.add_axes((0.25, 0.07, 0.5, 0.02)), snapshot))
         sheet('demo', (14, 9.4), lambda f: everything(f, snapshot, history, caption))
     sheet('errors', (10, 4), lambda f: errors(f.add_axes((0.08, 0.14, 0.90, 0.82)), history))
     return saved
@@ -83,12 +87,14 @@ def everything(figure, snapshot: Snapshot, history: History, caption: str) -> No
     figure.text(0.5, 0.965, caption, ha='center', va='center', fontsize=14)
     for i in (0, 1):
         overlay(figure.add_axes((0.01 + 0.325 * i, 0.44, 0.32, 0.32 * 14 / 9.4)), snapshot, i)
-    backbone(figure.add_axes((0.655, 0.475, 0.315, 0.455), projection='3d'), figure.add_axes((0.73, 0.465, 0.2, 0.012)), snapshot)
+    backbone(figure.add_axes((0.655, 0.475, 0.315, 0.455), projection='3d'),
+             figure.add_axes((0.73, 0.465, 0.2, 0.012)), snapshot)
     errors(figure.add_axes((0.06, 0.075, 0.925, 0.29)), history)
 
 
 def overlay(ax, snapshot: Snapshot, plane: int) -> None:
-    """The image of plane 0 (A) or 1 (B) around the device, with the reprojected backbone and its tip, which an inset magnifies."""
+    """The image of plane 0 (A) or 1 (B) around the device, with the reprojected backbone and its tip, which an inset
+    magnifies."""
     image, P = snapshot.images[plane], snapshot.P[plane]
     found, truth = project(P, snapshot.points), project(P, snapshot.truth)
     left, top, side = window(np.vstack([found, truth]), image.shape)
@@ -108,7 +114,8 @@ def overlay(ax, snapshot: Snapshot, plane: int) -> None:
     inset.plot(*truth.T, ':', color=TRUTH, lw=1.4)
     inset.plot(*found[-1], '+', ms=18, color=TIP, mew=2)
     ax.set(xlim=(left, left + side), ylim=(top + side, top))
-    inset.set(xlim=found[-1, 0] + np.array([-1, 1]) * INSET_HALF_PX, ylim=found[-1, 1] + np.array([1, -1]) * INSET_HALF_PX)
+    inset.set(xlim=found[-1, 0] + np.array([-1, 1]) * INSET_HALF_PX,
+              ylim=found[-1, 1] + np.array([1, -1]) * INSET_HALF_PX)
     bar = SCALE_BAR * pixels_per_metre(P, snapshot.points) / side
     begin = 0.96 - bar if free_corner(across, INSET, [c for c in ((1, 1), (0, 1)) if c != corner]) == (1, 1) else 0.04
     for colour, width in ((GROUND, 8), (TRUTH, 4)):     # the dark rim shows it on bright ground
@@ -119,11 +126,12 @@ def overlay(ax, snapshot: Snapshot, plane: int) -> None:
 
 
 def window(points_px: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float, float]:
-    """Left, top and side (px) of the square around (N, 2) points with a margin, inside the image of `shape` (H, W) where that is large enough."""
+    """Left, top and side (px) of the square around (N, 2) points with a margin, inside the image of `shape` (H, W)
+    where that is large enough."""
     low, high = points_px.min(axis=0), points_px.max(axis=0)
     side = min((high - low).max() + 2 * MARGIN_PX, min(shape))
     room = np.array([shape[1], shape[0]]) - side
-    left, top = np.clip((low + high - side) / 2, 0, room) - 0.5     # pixel centres are integers: the image begins at -1/2
+    left, top = np.clip((low + high - side) / 2, 0, room) - 0.5   # pixel centres are integers: the image begins at -1/2
     return float(left), float(top), float(side)
 
 
@@ -145,7 +153,8 @@ def backbone(ax, bar_ax, snapshot: Snapshot) -> None:
     ax.add_collection3d(curve)
     ax.plot(*truth.T, '--', color=TRUTH, lw=1.5, label='truth', zorder=10)
     ax.plot(*found[-1:].T, 'o', color=TIP, ms=9, label='tip found', zorder=11)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel='x (mm)', ylabel='y (mm)', zlabel='z (mm)')
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel='x (mm)', ylabel='y (mm)',
+           zlabel='z (mm)')
     ax.set_box_aspect(half, zoom=min(0.9, 0.6 * np.linalg.norm(half) / half[2]))     # a tall box keeps to its axes
     ax.tick_params(labelsize=8)
     ax.patch.set_visible(False)
@@ -165,8 +174,8 @@ def errors(ax, history: History) -> None:
     else:
         ax.set_ylim(0, 1.25 * history.tip.max(initial=1e-6) * 1e3)     # room for the legend
     if len(history.unanswered):
-        ax.plot(history.unanswered, np.zeros(len(history.unanswered)), '|', color=MISSED, ms=14, mew=1.5, label='no answer', clip_on=False,
-                transform=ax.get_xaxis_transform())
+        ax.plot(history.unanswered, np.zeros(len(history.unanswered)), '|', color=MISSED, ms=14, mew=1.5,
+                label='no answer', clip_on=False, transform=ax.get_xaxis_transform())
     ax.set(xlabel='time (s)', ylabel='error (mm)')
     ax.grid(True)
     ax.legend(loc='upper right', ncol=3)

@@ -1,4 +1,5 @@
-"""Poses from the tf messages of a bag, as tf2 would have told them with all of the recording at hand: a small tree of frames, interpolated in time."""
+"""Poses from the tf messages of a bag, as tf2 would have told them with all of the recording at hand: a small tree of
+frames, interpolated in time."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Edge:
         if after < len(self.stamps) and self.stamps[after] == stamp:
             return _pose(self.poses[stamp])
         if not 0 < after < len(self.stamps):
-            raise NoTransform(f'{short(child)} in {short(self.parent)} was recorded from {self.stamps[0] / 1e9:.3f} to {self.stamps[-1] / 1e9:.3f} s, not at {stamp / 1e9:.3f} s')
+            raise NoTransform(f'{short(child)} in {short(self.parent)} was recorded from {self.stamps[0] / 1e9:.3f} to '
+                              f'{self.stamps[-1] / 1e9:.3f} s, not at {stamp / 1e9:.3f} s')
         early, late = self.stamps[after - 1:after + 1]
         first, second = self.poses[early], self.poses[late]
         share = (stamp - early) / (late - early)
@@ -46,7 +48,8 @@ def _pose(values: tuple) -> tuple[np.ndarray, np.ndarray]:
 
 
 class RecordedPoses:
-    """A Lookup (see worker): (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples. Raises NoTransform."""
+    """A Lookup (see worker): (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested
+    tuples. Raises NoTransform."""
 
     def __init__(self):
         self._edges: dict[str, Edge] = {}
@@ -104,7 +107,8 @@ class RecordedPoses:
 
 
 def read_poses(bag, topics: dict[str, str], copy=None) -> RecordedPoses:
-    """The poses of a bag (of open_bag) whose tf topics are `topics`, name -> one of NAMES; `copy` gets every message (a Recorded) and its log time."""
+    """The poses of a bag (of open_bag) whose tf topics are `topics`, name -> one of NAMES; `copy` gets every message
+    (a Recorded) and its log time."""
     poses = RecordedPoses()
     for recorded in bag.messages([topic for topic in topics if topic in bag.types()]):
         if copy:

@@ -13,8 +13,10 @@ RATE_HZ = 15.0              # where nothing tells
 FIRST_STAMP_NS = 10**9      # a stamp of zero says nothing about time
 
 
-def stamps_of(counts: list[int], times: list[list[int] | None], rate_hz: float | None = None, path: str | None = None) -> tuple[list[list[int]], list[str]]:
-    """Stamps in ns of so many images of both planes and a line where they are a guess: from the file at `path`, at a rate, or the `times` that their files say.
+def stamps_of(counts: list[int], times: list[list[int] | None], rate_hz: float | None = None,
+              path: str | None = None) -> tuple[list[list[int]], list[str]]:
+    """Stamps in ns of so many images of both planes and a line where they are a guess: from the file at `path`, at a
+    rate, or the `times` that their files say.
 
     Raises ToolError.
     """
@@ -30,10 +32,12 @@ def stamps_of(counts: list[int], times: list[list[int] | None], rate_hz: float |
         notes = []
     elif told:
         silent = times.index(None)
-        notes = [f'plane {PLANES[silent].upper()} does not tell its rate: it is taken for that of plane {PLANES[1 - silent].upper()}, {told[0]:.4g}/s; --rate says it']
+        notes = [f'plane {PLANES[silent].upper()} does not tell its rate: '
+                 f'it is taken for that of plane {PLANES[1 - silent].upper()}, {told[0]:.4g}/s; --rate says it']
     else:
         notes = [f'no file tells the rate: {RATE_HZ:g} images/s are a guess; --rate or --stamps says it']
-    return [even_stamps(rate_hz or (told[0] if told else RATE_HZ), n) if rate_hz or t is None else t for n, t in zip(counts, times)], notes
+    return [even_stamps(rate_hz or (told[0] if told else RATE_HZ), n) if rate_hz or t is None else t
+            for n, t in zip(counts, times)], notes
 
 
 def mean_rate(stamps_ns: list[int]) -> float | None:
@@ -42,7 +46,8 @@ def mean_rate(stamps_ns: list[int]) -> float | None:
 
 
 def count_pairs(stamps_ns: list[list[int]]) -> tuple[int, list[str]]:
-    """How many pairs a node with the default sync_slop makes of the images of both planes, and a line where that is not all of them."""
+    """How many pairs a node with the default sync_slop makes of the images of both planes, and a line where that is not
+    all of them."""
     slop_ns = round(Config().input.sync_slop * 1e9)
     pairer = Pairer(slop_ns)
     for stamp, plane in sorted((stamp, plane) for plane, stamps in zip(PLANES, stamps_ns) for stamp in stamps):
@@ -50,8 +55,10 @@ def count_pairs(stamps_ns: list[list[int]]) -> tuple[int, list[str]]:
     pairs = pairer.counts.pairs
     if all(len(stamps) == pairs for stamps in stamps_ns):
         return pairs, []
-    planes = (f'plane {p.upper()} has {len(stamps)} images' + (f' at {rate:.4g}/s' if (rate := mean_rate(stamps)) else '') for p, stamps in zip(PLANES, stamps_ns))
-    return pairs, [f'{" and ".join(planes)}: {sum(map(len, stamps_ns)) - 2 * pairs} have no partner within {slop_ns / 1e6:g} ms']
+    planes = (f'plane {p.upper()} has {len(stamps)} images'
+              + (f' at {rate:.4g}/s' if (rate := mean_rate(stamps)) else '') for p, stamps in zip(PLANES, stamps_ns))
+    return pairs, [f'{" and ".join(planes)}: {sum(map(len, stamps_ns)) - 2 * pairs} have no partner within '
+                   f'{slop_ns / 1e6:g} ms']
 
 
 def read_stamps(path: str) -> list[int]:

@@ -49,11 +49,13 @@ def crop(view: View, rows: slice, columns: slice) -> View:
     """The view of these rows and columns of the image alone."""
     shift = np.array([[1, 0, -columns.start], [0, 1, -rows.start], [0, 0, 1]], float)
     d = view.distortion
-    return replace(view, P=shift @ view.P, width=columns.stop - columns.start, height=rows.stop - rows.start, distortion=d and replace(d, K=shift @ d.K))
+    return replace(view, P=shift @ view.P, width=columns.stop - columns.start, height=rows.stop - rows.start,
+                   distortion=d and replace(d, K=shift @ d.K))
 
 
 def decompose(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K (3, 3), R (3, 3) and t (3,) of P = K [R | t] (HZ 6.2.4); K[2, 2] = 1, det R = 1, K[1, 1] > 0; a mirrored image has K[0, 0] < 0."""
+    """K (3, 3), R (3, 3) and t (3,) of P = K [R | t] (HZ 6.2.4); K[2, 2] = 1, det R = 1, K[1, 1] > 0; a mirrored image
+    has K[0, 0] < 0."""
     K, R = rq(P[:, :3])
     signs = np.where(np.diag(K) < 0, -1.0, 1.0)
     K, R = K * signs, signs[:, None] * R
@@ -75,21 +77,25 @@ def plane_angle(views: tuple[View, View]) -> float:
 
 @lru_cache(16)
 def check(views: tuple[View, View], radius: float) -> None:
-    """Raises GeometryError where a device of `radius` (m) can't be reconstructed with these views. What has passed is known."""
+    """Raises GeometryError where a device of `radius` (m) can't be reconstructed with these views. What has passed is
+    known."""
     check_pair(views)
     check_scale(views, radius)
 
 
 def check_pair(views: tuple[View, View]) -> None:
-    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel without a baseline across."""
+    """Raises GeometryError where two views can't see depth: sources that coincide, or planes that are (nearly) parallel
+    without a baseline across."""
     sources = [source(v.P) for v in views]
     apart = sources[1] - sources[0]
     baseline, far = np.linalg.norm(apart), max(np.linalg.norm(s) for s in sources) + 1e-3
     if baseline < 1e-3:
-        raise GeometryError(f'the sources of planes a and b coincide ({baseline * 1000:.2g} mm apart): no depth can be seen')
+        raise GeometryError(f'the sources of planes a and b coincide ({baseline * 1000:.2g} mm apart): '
+                            'no depth can be seen')
     # A rectified stereo pair has parallel axes but sees depth through its baseline; biplane sees it through the angle.
     if plane_angle(views) < MIN_PLANE_ANGLE and np.linalg.norm(np.cross(apart, views[0].P[2, :3])) < 0.02 * far:
-        raise GeometryError(f'planes a and b are parallel ({np.rad2deg(plane_angle(views)):.2g} degrees): no depth can be seen')
+        raise GeometryError(f'planes a and b are parallel ({np.rad2deg(plane_angle(views)):.2g} degrees): '
+                            'no depth can be seen')
 
 
 def project(P: np.ndarray, X: np.ndarray) -> np.ndarray:
@@ -110,12 +116,15 @@ def projection_jacobian(P: np.ndarray, X: np.ndarray) -> np.ndarray:
     return (P[:2, :3] - (x[..., :2] / x[..., 2:])[..., None] * P[2, :3]) / x[..., 2, None, None]
 
 
-def calibration_covariance(views: Sequence[View], X: np.ndarray, T: np.ndarray, sigma_px: float | np.ndarray) -> np.ndarray:
-    """(N, 3, 3) m^2 of (N, 3) points of a curve with (N, 3) tangents that planes displaced by `sigma_px`, one for all or (N,), along u and v cause.
+def calibration_covariance(views: Sequence[View], X: np.ndarray, T: np.ndarray,
+                           sigma_px: float | np.ndarray) -> np.ndarray:
+    """(N, 3, 3) m^2 of (N, 3) points of a curve with (N, 3) tangents that planes displaced by `sigma_px`, one for all
+    or (N,), along u and v cause.
 
     Each plane v shifts the curve by d_v = J_v dX across its projection, and both on average along it:
-    n_v J_v dX = n_v d_v, sum_v t_v (J_v dX - d_v) / |J_v T| = 0, with n_v and t_v across and along the projection. Where the curve runs along epipolar
-    lines that leaves its depth open; there what a point would tell counts a little (POINT).
+    n_v J_v dX = n_v d_v, sum_v t_v (J_v dX - d_v) / |J_v T| = 0, with n_v and t_v across and along the projection.
+    Where the curve runs along epipolar lines that leaves its depth open; there what a point would tell counts a little
+    (POINT).
     """
     J = np.stack([projection_jacobian(v.P, X) for v in views])                              # (2, N, 2, 3)
     step = (J @ T[:, :, None])[..., 0]
@@ -126,16 +135,19 @@ def calibration_covariance(views: Sequence[View], X: np.ndarray, T: np.ndarray, 
     tangential = np.einsum('vnk,vnki->ni', along / speed, J) / np.sqrt((1 / speed**2).sum(axis=0))
     A = np.concatenate([normal, tangential[:, None]], axis=1)
     information = A.transpose(0, 2, 1) @ A + POINT * (J.transpose(0, 1, 3, 2) @ J).sum(axis=0)
-    return np.linalg.inv(information + np.eye(3)) * np.square(sigma_px)[..., None, None]      # nothing is known less well than to sigma_px metres
+    # nothing is known less well than to sigma_px metres
+    return np.linalg.inv(information + np.eye(3)) * np.square(sigma_px)[..., None, None]
 
 
 def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
     """Magnification at the mean of (N, 3) points: image px per m across the viewing ray."""
-    return float(np.sqrt(abs(np.linalg.det(P[:, :3]))) / abs(np.mean(depth(P, X))))     # det K R = f_u f_v, since |P[2, :3]| = 1
+    # det K R = f_u f_v, since |P[2, :3]| = 1
+    return float(np.sqrt(abs(np.linalg.det(P[:, :3]))) / abs(np.mean(depth(P, X))))
 
 
 def isocenter(views: Sequence[View]) -> np.ndarray:
-    """(3,) m, where two planes look: for a biplane system the point nearest to both central rays (through the image centres).
+    """(3,) m, where two planes look: for a biplane system the point nearest to both central rays (through the image
+    centres).
 
     Those of a rectified stereo pair are parallel: it looks at the distance where its images are STEREO_SHIFT apart.
     """
@@ -151,14 +163,15 @@ def isocenter(views: Sequence[View]) -> np.ndarray:
 
 
 def check_scale(views: tuple[View, View], radius: float) -> None:
-    """Raises GeometryError where a device of `radius` (m) would be a quarter as wide as an image, or wider, at the `isocenter`, or less than a tenth of a
-    pixel: no C-arm is made so; P may not be in metres."""
+    """Raises GeometryError where a device of `radius` (m) would be a quarter as wide as an image, or wider, at the
+    `isocenter`, or less than a tenth of a pixel: no C-arm is made so; P may not be in metres."""
     center = isocenter(views)[None]
     for v in views:
         with np.errstate(divide='ignore'):
             half_width_px = radius * pixels_per_metre(v.P, center)
         if not 0.05 <= half_width_px < min(v.width, v.height) / 8:
-            raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be {2 * half_width_px:.3g} px wide where the planes look: is P in metres?')
+            raise GeometryError(f'plane {v.name}: a device of radius {radius * 1e3:g} mm would be '
+                                f'{2 * half_width_px:.3g} px wide where the planes look: is P in metres?')
 
 
 def fundamental(Pa: np.ndarray, Pb: np.ndarray) -> np.ndarray:
@@ -180,7 +193,8 @@ def triangulate(Pa: np.ndarray, Pb: np.ndarray, a_px: np.ndarray, b_px: np.ndarr
     Starts at the linear solution (HZ 12.2) and takes Newton steps on the reprojection error (Gauss-Newton Hessian),
     all points at once. NaN where a point can't be triangulated.
     """
-    a_px, b_px = (np.where(np.abs(px) < 1e9, px, np.nan) for px in (a_px, b_px))    # farther away nothing can be told, and squares overflow
+    # farther away nothing can be told, and squares overflow
+    a_px, b_px = (np.where(np.abs(px) < 1e9, px, np.nan) for px in (a_px, b_px))
     A = np.stack([a_px[:, 0, None] * Pa[2] - Pa[0], a_px[:, 1, None] * Pa[2] - Pa[1],
                   b_px[:, 0, None] * Pb[2] - Pb[0], b_px[:, 1, None] * Pb[2] - Pb[1]], axis=1)
     bad = ~np.isfinite(A).all(axis=(1, 2))
@@ -220,7 +234,7 @@ def undistort(view: View, points_px: np.ndarray) -> np.ndarray:
     if d.model == 'equidistant':
         return cv2.fisheye.undistortPoints(p, d.K, d.D, R=d.R, P=K)[:, 0]
     ideal = cv2.undistortPoints(p, d.K, d.D, R=d.R, P=K)[:, 0]
-    for _ in range(10):         # OpenCV stops after five fixed-point steps; go on in the same way to sub-pixel agreement
+    for _ in range(10):     # OpenCV stops after five fixed-point steps; go on in the same way to sub-pixel agreement
         ideal = ideal - (distort(view, ideal) - p[:, 0])
     return ideal
 

@@ -27,7 +27,8 @@ def even_steps(length: float, step: float) -> np.ndarray:
 
 
 def resample(points: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """A cubic spline through (N, 3) points, at equal arc-length steps: (M, 3) points whose last one is the last given, and (M,) arc lengths."""
+    """A cubic spline through (N, 3) points, at equal arc-length steps: (M, 3) points whose last one is the last given,
+    and (M,) arc lengths."""
     points = points[np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-12)]
     spline = CubicSpline(arc_length(points), points, bc_type='natural') if len(points) > 2 else None
     if spline is not None:
@@ -46,7 +47,8 @@ def curvature(points: np.ndarray) -> np.ndarray:
 
 
 def frames(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) tangents and (N, 3) normals, unit vectors, at (N, 3) points; the normals turn with the curve and not about it."""
+    """(N, 3) tangents and (N, 3) normals, unit vectors, at (N, 3) points; the normals turn with the curve and not about
+    it."""
     tangents = np.gradient(points, arc_length(points), axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     normals = np.empty_like(tangents)
@@ -66,7 +68,8 @@ def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def distance_to(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """(N,) distance of (N, d) points to the nearer of the two segments of the (M, d) polyline that meet at its nearest vertex."""
+    """(N,) distance of (N, d) points to the nearer of the two segments of the (M, d) polyline that meet at its nearest
+    vertex."""
     near = np.clip(cKDTree(line).query(points)[1][:, None] + [-1, 0], 0, len(line) - 2)
     segment, rel = line[near + 1] - line[near], points[:, None] - line[near]
     t = np.clip((rel * segment).sum(-1) / np.maximum((segment * segment).sum(-1), 1e-30), 0, 1)

@@ -11,7 +11,8 @@ from .curve import arc_length, at_arc_length
 
 KNOT_SPACING = 0.008        # m: a device bends with radii of some cm
 MIN_CONTROL, MAX_CONTROL = 7, 48
-UNIFORM_CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6    # row p: coefficients of u^p of the four weights
+# row p: coefficients of u^p of the four weights
+UNIFORM_CUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
 DERIVATIVES = UNIFORM_CUBIC, np.diag([1.0, 2.0, 3.0], 1) @ UNIFORM_CUBIC, np.diag([2.0, 6.0], 2) @ UNIFORM_CUBIC
 
 
@@ -24,9 +25,11 @@ class Spline3:
     control: np.ndarray     # (n, 3) m
 
     def weights(self, s: np.ndarray, *derivatives: int) -> tuple[np.ndarray, ...]:
-        """(N, 4) index of the control points that count at each arc length, and for each of `derivatives` (N, 4) their weights (de Boor 1978, uniform cubic).
+        """(N, 4) index of the control points that count at each arc length, and for each of `derivatives` (N, 4) their
+        weights (de Boor 1978, uniform cubic).
 
-        Knots are uniform, so that equal control point steps are equal speed right to the ends. Beyond them the outermost pieces go on.
+        Knots are uniform, so that equal control point steps are equal speed right to the ends. Beyond them the
+        outermost pieces go on.
         """
         pieces = len(self.control) - 3
         h = (self.stop - self.start) / pieces
@@ -58,12 +61,14 @@ class Spline3:
 
 @lru_cache(MAX_CONTROL)
 def bending(n: int) -> np.ndarray:
-    """(n - 3, n) third differences of the control points: zero for a curve of constant curvature, as a robot's tubes bend."""
+    """(n - 3, n) third differences of the control points: zero for a curve of constant curvature, as a robot's tubes
+    bend."""
     return np.diff(np.eye(n), 3, axis=0)
 
 
 def through(points: np.ndarray, extension: float, smoothing: float = 1e-3) -> Spline3:
-    """The spline over arc length near (N, 3) points in m, going on by `extension` m at both ends; s = 0 at the first point."""
+    """The spline over arc length near (N, 3) points in m, going on by `extension` m at both ends; s = 0 at the first
+    point."""
     length = arc_length(points)[-1]
     s = np.linspace(0, length, max(int(length / 0.0005), 50))
     points = at_arc_length(points, s)
@@ -76,7 +81,8 @@ def through(points: np.ndarray, extension: float, smoothing: float = 1e-3) -> Sp
 
 
 def prolong(spline: Spline3, ends: tuple[bool, bool] | np.ndarray, by: float) -> tuple[Spline3, float]:
-    """The spline going on straight by `by` m at the first and / or last end, and what is to be added to its old arc lengths."""
+    """The spline going on straight by `by` m at the first and / or last end, and what is to be added to its old arc
+    lengths."""
     s = np.linspace(spline.start, spline.stop, 400)
     points, (first, last) = spline(s), spline(s[[0, -1]], 1)
     before = points[0] - np.linspace(by, 0, 20, endpoint=False)[:, None] * first if ends[0] else points[:0]

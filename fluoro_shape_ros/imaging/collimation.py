@@ -1,8 +1,9 @@
 """Where the exposed field ends: blades in straight edges, an intensifier in a circle.
 
-An image's edges (Canny 1986) beyond which it stays darker are what blades and intensifiers make, and dense anatomy. Lines (Hough) and a circle through them are
-the field's if they are seen along nearly all of their length, nothing goes on beyond them, and hardly anything is to be seen there. All px here are those of an
-image of SMALLEST_PX to twice as many.
+An image's edges (Canny 1986) beyond which it stays darker are what blades and intensifiers make, and dense anatomy.
+Lines (Hough) and a circle through them are the field's if they are seen along nearly all of their length, nothing goes
+on beyond them, and hardly anything is to be seen there. All px here are those of an image of SMALLEST_PX to twice as
+many.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ import cv2
 import numpy as np
 
 STEEP = 3.0             # median gradients, that an edge has at least
-SHORTEST = 0.25         # of an image's smaller side, that the edge of a blade is long; half of it where there is no other
+SHORTEST = 0.25         # of an image's smaller side, that the edge of a blade is long;
+                        # half of it where there is no other
 ALIGNED = 0.9           # cosine of the angle between an edge and where it should run
-MAYBE, SEEN = 0.5, 0.7  # share of an outline that must be an edge, where one could be seen: at all, and where the others leave it exposed
+MAYBE, SEEN = 0.5, 0.7  # share of an outline that must be an edge, where one could be seen: at all, and where the
+                        # others leave it exposed
 BESIDE_PX = np.arange(2, 6)     # before an edge, where it is as bright as it gets there, and as far beyond it
 WIDE_PX = 14            # what is dark for so far beyond an edge is no device
 EVERY_PX = 5            # that is looked at farther on
@@ -51,12 +54,14 @@ class Outline:
         if self.round:
             turn = np.linspace(0, 2 * np.pi, 360)
             inside = np.zeros_like(field)
-            cv2.fillConvexPoly(inside, at(self.line[:2] + self.line[2] * np.stack([np.cos(turn), np.sin(turn)], axis=1)), 255, cv2.LINE_8, 4)
+            cv2.fillConvexPoly(inside, at(self.line[:2] + self.line[2] * np.stack([np.cos(turn), np.sin(turn)],
+                                                                                  axis=1)), 255, cv2.LINE_8, 4)
             cv2.min(field, inside, field)
         else:
             n, foot = self.line[:2], self.line[2] * self.line[:2]
             along = far * np.array([-n[1], n[0]])
-            cv2.fillConvexPoly(field, at(np.array([foot - along, foot + along, foot + along - far * n, foot - along - far * n])), 0, cv2.LINE_8, 4)
+            cv2.fillConvexPoly(field, at(np.array([foot - along, foot + along, foot + along - far * n,
+                                                   foot - along - far * n])), 0, cv2.LINE_8, 4)
 
     def inside_by(self, uv: np.ndarray) -> np.ndarray:
         """(...) px by which (..., 2) points lie on its exposed side."""
@@ -69,7 +74,8 @@ def outlines(image: np.ndarray) -> list[Outline]:
     """Of the exposed field in an (h, w) float32 image; none where it is exposed everywhere."""
     edges, shortest = Edges.of(image), SHORTEST * min(image.shape)
     found: list[Outline] = []
-    candidates = [o for o in (*_straight(edges, shortest), *_round(edges, shortest)) if _share(o, (), shortest) >= MAYBE and edges.end_at(o)]
+    candidates = [o for o in (*_straight(edges, shortest), *_round(edges, shortest))
+                  if _share(o, (), shortest) >= MAYBE and edges.end_at(o)]
     for o in sorted(candidates, key=lambda o: -np.count_nonzero(o.seen)):
         its_own = np.all([o.seen, *(np.abs(f.inside_by(o.points)) > SAME_PX for f in found)], axis=0)
         if np.count_nonzero(its_own) >= shortest:
@@ -85,7 +91,8 @@ def outlines(image: np.ndarray) -> list[Outline]:
 
 
 def _share(outline: Outline, others: Sequence[Outline], shortest: float) -> float:
-    """The share of an outline that is seen, of what the others leave exposed of it; 0 where another one goes on beyond it."""
+    """The share of an outline that is seen, of what the others leave exposed of it;
+    0 where another one goes on beyond it."""
     if any(np.count_nonzero(o.seen & (outline.inside_by(o.points) < -SAME_PX)) > shortest / 2 for o in others):
         return 0.0
     exposed = np.all([~outline.hidden, *(o.inside_by(outline.points) > 0 for o in others)], axis=0)
@@ -114,7 +121,8 @@ class Edges:
     @classmethod
     def of(cls, image: np.ndarray) -> Edges:
         smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
-        gradient = [cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3, borderType=cv2.BORDER_REPLICATE) for d in ((1, 0), (0, 1))]
+        gradient = [cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3, borderType=cv2.BORDER_REPLICATE)
+                    for d in ((1, 0), (0, 1))]
         steep = cv2.magnitude(*gradient)
         least = max(STEEP * float(np.median(steep[::2, ::2])), float(steep.max()) / FAINTEST, 1e-12)
         thin = cv2.Canny(*((g * (CANNY / least)).astype(np.int16) for g in gradient), CANNY, 2 * CANNY, L2gradient=True)
@@ -124,13 +132,17 @@ class Edges:
         v, u = np.nonzero(thin)
         places = np.stack([u, v], axis=1)
         half = 0.5 * sum(_sampled(smooth, places, bright[v, u], side * BESIDE_PX).mean(axis=1) for side in (-1, 1))
-        darker = _sampled(smooth, places, bright[v, u], -np.arange(BESIDE_PX[-1] + 1, max(image.shape), EVERY_PX)) < half[:, None]
+        darker = (_sampled(smooth, places, bright[v, u], -np.arange(BESIDE_PX[-1] + 1, max(image.shape), EVERY_PX))
+                  < half[:, None])
         stays = darker[:, :(WIDE_PX - BESIDE_PX[-1]) // EVERY_PX + 1].all(axis=1) & (darker.mean(axis=1) > 0.5)
         thin[v[~stays], u[~stays]] = 0
-        return cls(smooth, places[stays], cv2.dilate(thin, np.ones((3, 3), np.uint8)) > 0, thin, bright, middles, blocks.ravel())
+        return cls(smooth, places[stays], cv2.dilate(thin, np.ones((3, 3), np.uint8)) > 0, thin, bright, middles,
+                   blocks.ravel())
 
-    def outline(self, points: np.ndarray, inward: np.ndarray, line: np.ndarray, shortest: float, round: bool = False) -> Iterator[Outline]:
-        """An outline through (N, 2) points, with its exposed side where `inward` (N, 2) points, if `shortest` px of it are seen."""
+    def outline(self, points: np.ndarray, inward: np.ndarray, line: np.ndarray, shortest: float,
+                round: bool = False) -> Iterator[Outline]:
+        """An outline through (N, 2) points, with its exposed side where `inward` (N, 2) points, if `shortest` px of it
+        are seen."""
         u, v = np.round(points).astype(int).T
         seen = self.near[v, u]
         seen[seen] = np.einsum('nk,nk->n', self.bright[v[seen], u[seen]], inward[seen]) > ALIGNED
@@ -149,7 +161,8 @@ class Edges:
         """The same outline, through the middle of its edge."""
         if outline.round:
             return outline
-        du, dv, u, v = cv2.fitLine(self.places[np.abs(outline.inside_by(self.places)) <= 1.5].astype(np.float32), cv2.DIST_HUBER, 0, 0.01, 0.01).ravel()
+        du, dv, u, v = cv2.fitLine(self.places[np.abs(outline.inside_by(self.places)) <= 1.5].astype(np.float32),
+                                   cv2.DIST_HUBER, 0, 0.01, 0.01).ravel()
         normal = np.array([-dv, du]) * np.sign(outline.line[:2] @ [-dv, du])
         return replace(outline, line=np.append(normal, normal @ [u, v]))
 
@@ -206,7 +219,8 @@ def _round(edges: Edges, shortest: float) -> Iterator[Outline]:
     turn = np.arange(0, 2 * np.pi, 1 / max(radius, 1.0))
     out = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     within = _within(middle + radius * out, h, w)
-    yield from edges.outline((middle + radius * out)[within], -out[within], np.append(middle, radius), shortest, round=True)
+    yield from edges.outline((middle + radius * out)[within], -out[within], np.append(middle, radius), shortest,
+                             round=True)
 
 
 def _within(points: np.ndarray, h: int, w: int) -> np.ndarray:

@@ -7,7 +7,8 @@ import numpy as np
 
 
 def gaussian_kernels(sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sampled Gaussian and its first and second derivative, float32, +-4 sigma; exact on parabolas (sum x^2 g'' / 2 = 1)."""
+    """Sampled Gaussian and its first and second derivative, float32, +-4 sigma; exact on parabolas
+    (sum x^2 g'' / 2 = 1)."""
     r = int(np.ceil(4 * sigma))
     x = np.arange(-r, r + 1)
     g = np.exp(-0.5 * (x / sigma) ** 2)

@@ -1,4 +1,5 @@
-"""From the branches of one image to device candidates: chains of branches that continue one another, across crossings and gaps."""
+"""From the branches of one image to device candidates: chains of branches that continue one another, across crossings
+and gaps."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def find_candidates(ridges: Ridges, min_length_px: float, count: int = 8) -> lis
 
 
 def _strong_branches(ridges: Ridges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(B,) first point, (B,) the one past the last and (B,) mean strength of the branches that are no noise: long and strong enough together."""
+    """(B,) first point, (B,) the one past the last and (B,) mean strength of the branches that are no noise: long and
+    strong enough together."""
     length = np.diff(ridges.start)
     if not len(ridges.z):
         return length, length, length
@@ -48,7 +50,8 @@ def _strong_branches(ridges: Ridges) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _link_ends(ridges: Ridges, start: np.ndarray, stop: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """(2 B,) for each branch end (2 b: first, 2 b + 1: last) the end it continues in, or -1: best continuations first, each end once."""
+    """(2 B,) for each branch end (2 b: first, 2 b + 1: last) the end it continues in, or -1: best continuations first,
+    each end once."""
     step_px = ridges.step_px
     inner = np.minimum(END_PX // step_px, stop - start - 1)
     ends = ridges.points_px[np.stack([start, stop - 1], axis=1).ravel()]
@@ -62,7 +65,8 @@ def _link_ends(ridges: Ridges, start: np.ndarray, stop: np.ndarray, strength: np
     gap, d = gap[i, j], d[i, j]
     slack = 1.5 * step_px / np.maximum(d, 1.5 * step_px)                    # direction of a short gap is uncertain
     along = gap / np.maximum(d, 1e-9)[:, None]
-    turn_i, turn_j, between = (np.arccos(np.clip((a * b).sum(axis=1), -1, 1)) for a, b in ((along, out[i]), (-along, out[j]), (-out[i], out[j])))
+    turn_i, turn_j, between = (np.arccos(np.clip((a * b).sum(axis=1), -1, 1))
+                               for a, b in ((along, out[i]), (-along, out[j]), (-out[i], out[j])))
     turn = np.maximum(between, np.maximum(turn_i, turn_j) - np.arcsin(slack))
     ratio = np.abs(np.log(strength[i] / strength[j]))
     cost = d / GAP_PX + (turn / MAX_TURN) ** 2 + 0.5 * ratio
@@ -89,8 +93,10 @@ def _follow(partner: np.ndarray, count: int) -> list[list[int]]:
     return chains
 
 
-def _joined(ridges: Ridges, start: np.ndarray, stop: np.ndarray, chains: list[list[int]], min_length_px: float, count: int) -> list[Candidate]:
-    """One line from the branches of each chain, a point about every px; of those that are long enough the first `count`.
+def _joined(ridges: Ridges, start: np.ndarray, stop: np.ndarray, chains: list[list[int]], min_length_px: float,
+            count: int) -> list[Candidate]:
+    """One line from the branches of each chain, a point about every px; of those that are long enough the first
+    `count`.
 
     chains: for each the ends at which its branches are entered.
     """

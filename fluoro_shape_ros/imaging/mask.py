@@ -14,15 +14,16 @@ STILL_PX = 0.05         # a shift of less is not worth an interpolation
 def subtract(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """(H, W) float32 image over mask: the share of the beam that was let through since, scaled to the mask's mean.
 
-    A division of counts is the subtraction of their logarithms (DSA). A sub-pixel shift between the two is estimated by phase correlation
-    and removed.
+    A division of counts is the subtraction of their logarithms (DSA). A sub-pixel shift between the two is estimated by
+    phase correlation and removed.
     """
     image = image.astype(np.float32)
     du, dv = shift_between(mask, image)
     if max(abs(du), abs(dv)) < STILL_PX:
         moved = mask.copy()
     else:
-        moved = cv2.warpAffine(mask, np.array([[1, 0, du], [0, 1, dv]], np.float32), mask.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        moved = cv2.warpAffine(mask, np.array([[1, 0, du], [0, 1, dv]], np.float32), mask.shape[::-1],
+                               flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     level = float(moved.mean())
     floor = np.float32(max(0.02 * level, 1e-6))     # unexposed: nothing was let through before either
     image += floor
@@ -33,9 +34,11 @@ def subtract(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def shift_between(mask: np.ndarray, image: np.ndarray) -> tuple[float, float]:
     """u, v in px by which the scene of (H, W) `mask` has moved in `image`; 0, 0 where no believable shift is found."""
-    small = [cv2.resize(i.astype(np.float32), None, fx=1 / SHRINK, fy=1 / SHRINK, interpolation=cv2.INTER_AREA) for i in (mask, image)]
+    small = [cv2.resize(i.astype(np.float32), None, fx=1 / SHRINK, fy=1 / SHRINK, interpolation=cv2.INTER_AREA)
+             for i in (mask, image)]
     small = [i - cv2.blur(i, (LOCAL, LOCAL)) for i in small]
-    h, w = (_even_dft_size(n) for n in small[0].shape)      # phaseCorrelate pads to a DFT size and errs by half a pixel where that is odd
+    # phaseCorrelate pads to a DFT size and errs by half a pixel where that is odd
+    h, w = (_even_dft_size(n) for n in small[0].shape)
     small = [np.ascontiguousarray(i[:h, :w]) for i in small]
     (du, dv), response = cv2.phaseCorrelate(*small, cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F))
     if response < 0.05 or max(abs(du), abs(dv)) * SHRINK > MAX_SHIFT_PX:

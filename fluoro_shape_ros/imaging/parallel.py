@@ -12,7 +12,8 @@ _other = ThreadPoolExecutor(1, 'plane')     # its thread is started when it is f
 
 
 def both(work: Callable, *arguments: Any, pixels: int) -> Any:
-    """What `work` gives for plane A and for plane B; each of `arguments` holds one of each. pixels: how many it works on, in all."""
+    """What `work` gives for plane A and for plane B; each of `arguments` holds one of each. pixels: how many it works
+    on, in all."""
     *others, last = zip(*arguments)
     if pixels <= FEW:
         return (*(work(*o) for o in others), work(*last))

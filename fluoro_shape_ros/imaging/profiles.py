@@ -17,15 +17,17 @@ WIDTHS = np.geomspace(0.5, 2.0, 21)      # 1 is among them
 
 
 def likeness(profiles: np.ndarray, half_width_px: float, noise: float = 0.0) -> np.ndarray:
-    """(..., K) correlation of (..., W) profiles, one sample a px about their middles, with the shadows of cylinders WIDTHS times as wide.
+    """(..., K) correlation of (..., W) profiles, one sample a px about their middles, with the shadows of cylinders
+    WIDTHS times as wide.
 
-    A smooth background (parabola) is taken off both. noise: standard deviation of a sample; what it takes from the correlation is given back (Spearman
-    1904, for attenuation), unless it is most of the profile.
+    A smooth background (parabola) is taken off both. noise: standard deviation of a sample; what it takes from the
+    correlation is given back (Spearman 1904, for attenuation), unless it is most of the profile.
     """
     basis, shadows = _cylinders(round(100 * half_width_px), profiles.shape[-1])
     a = profiles @ basis @ basis.T - profiles
     total = np.einsum('...w,...w->...', a, a)[..., None]
-    return np.minimum(a @ shadows.T / np.sqrt(np.maximum(total - (profiles.shape[-1] - 3) * noise**2, 0.5 * total) + 1e-24), 1.0)
+    return np.minimum(a @ shadows.T
+                      / np.sqrt(np.maximum(total - (profiles.shape[-1] - 3) * noise**2, 0.5 * total) + 1e-24), 1.0)
 
 
 @lru_cache(256)
@@ -39,7 +41,8 @@ def _cylinders(half_width_cpx: int, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def apparent_width(alike: list[np.ndarray]) -> tuple[float, np.ndarray]:
-    """How many times as wide as expected a device looks, the same in all V planes, and the (V,) likeness of each with a cylinder so wide.
+    """How many times as wide as expected a device looks, the same in all V planes, and the (V,) likeness of each with a
+    cylinder so wide.
 
     alike: (B, K) `likeness` of its pieces in each plane. The median piece counts: some may run along another edge.
     """
@@ -49,7 +52,8 @@ def apparent_width(alike: list[np.ndarray]) -> tuple[float, np.ndarray]:
 
 
 def odd_width(width: float, half_width_px: float) -> float:
-    """By how much `width` (see `apparent_width`) is wider or narrower than a device of this half width ever looks, as a natural logarithm; 0 where it is not.
+    """By how much `width` (see `apparent_width`) is wider or narrower than a device of this half width ever looks, as a
+    natural logarithm; 0 where it is not.
 
     Images are not all equally sharp, which counts the more the fewer pixels there are.
     """
@@ -58,7 +62,8 @@ def odd_width(width: float, half_width_px: float) -> float:
 
 
 def pieces(profiles: np.ndarray, good: np.ndarray, of: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(B, W) medians of successive PIECE `good` ones among (N, W) profiles, and of which line each is; one of all where a line has fewer.
+    """(B, W) medians of successive PIECE `good` ones among (N, W) profiles, and of which line each is; one of all where
+    a line has fewer.
 
     of: (N,) ascending, the line of each profile; all are of one by default.
     """
@@ -69,7 +74,8 @@ def pieces(profiles: np.ndarray, good: np.ndarray, of: np.ndarray | None = None)
     number = np.maximum(counts // PIECE, counts > 0)
     line = np.repeat(np.arange(len(counts)), number)
     place = np.arange(len(line)) - np.repeat(np.cumsum(number) - number, number)
-    within = (PIECE * place[:, None] + np.arange(PIECE)) % np.maximum(counts[line], 1)[:, None]    # a short line goes round and round
+    # a short line goes round and round
+    within = (PIECE * place[:, None] + np.arange(PIECE)) % np.maximum(counts[line], 1)[:, None]
     return middle(profiles[at[first[line][:, None] + within]], axis=1), line
 
 
@@ -79,7 +85,8 @@ def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def shadow(half_width_px: float, offsets_px: np.ndarray) -> np.ndarray:
-    """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred. h counts in hundredths of a px."""
+    """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred. h counts in hundredths
+    of a px."""
     return np.interp(offsets_px, *_shadow(round(100 * half_width_px)), 0.0, 0.0)
 
 
@@ -95,17 +102,21 @@ def _shadow(half_width_cpx: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def contrast_of(profiles: np.ndarray) -> np.ndarray:
-    """(...) share of the counts that the device takes at the middle of its (..., W) profiles, which are square roots of counts."""
-    return 1 - (profiles[..., profiles.shape[-1] // 2] / np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1), 1e-9)) ** 2
+    """(...) share of the counts that the device takes at the middle of its (..., W) profiles, which are square roots of
+    counts."""
+    return 1 - (profiles[..., profiles.shape[-1] // 2] / np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1),
+                                                                    1e-9)) ** 2
 
 
 def straight_on(contrast: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """What the contrast of a device would be if it were not seen at an angle, of this sine, to its axis (Beer-Lambert)."""
+    """What the contrast of a device would be if it were not seen at an angle, of this sine, to its axis
+    (Beer-Lambert)."""
     return 1 - (1 - contrast) ** np.clip(sine, 0.2, 1)
 
 
 def own_shadow(profiles: np.ndarray, beside: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(W,) the device's mean over the `good` ones of (N, W) profiles, made symmetric, unit depth; the `expected` one where there is too little of it.
+    """(W,) the device's mean over the `good` ones of (N, W) profiles, made symmetric, unit depth; the `expected` one
+    where there is too little of it.
 
     beside: see `background`.
     """
@@ -114,11 +125,13 @@ def own_shadow(profiles: np.ndarray, beside: np.ndarray, good: np.ndarray, expec
     mean = middle(profiles[good][::2], axis=0)
     dark = beside @ mean - mean
     dark = np.where(expected < OUTER, 0.0, 0.5 * (dark + dark[::-1]))
-    return dark / dark.max() if dark.max() > 0 and expected @ dark > 0.7 * np.sqrt((expected @ expected) * (dark @ dark)) else expected
+    return (dark / dark.max()
+            if dark.max() > 0 and expected @ dark > 0.7 * np.sqrt((expected @ expected) * (dark @ dark)) else expected)
 
 
 def background(expected: np.ndarray, offsets_px: np.ndarray) -> np.ndarray:
-    """(W, W) what gives of a profile the straight line through what is beside a device of the (W,) `expected` shadow."""
+    """(W, W) what gives of a profile the straight line through what is beside a device of the (W,) `expected`
+    shadow."""
     line = np.vander(offsets_px / offsets_px[-1], 2)
     outer = np.nonzero(expected < OUTER)[0]
     beside = np.zeros((len(line), len(line)))

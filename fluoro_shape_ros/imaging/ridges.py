@@ -34,7 +34,8 @@ class Ridges:
 
 def shrinking(half_width_px: float) -> int:
     """By how much an image may be made smaller, 1, 2 or 4, before lines of this half width are looked for in it."""
-    return next((k for k in (4, 2) if half_width_px / k >= NARROWEST_PX and ridge_scale(half_width_px) / k >= FINEST_SIGMA), 1)
+    return next((k for k in (4, 2) if half_width_px / k >= NARROWEST_PX
+                 and ridge_scale(half_width_px) / k >= FINEST_SIGMA), 1)
 
 
 def ridge_scale(half_width_px: float) -> float:
@@ -50,7 +51,8 @@ def find_ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int 
     if shrink > 1:
         size = image.shape[1] // shrink, image.shape[0] // shrink
         image, field = (a[:size[1] * shrink, :size[0] * shrink] for a in (image, field))
-        small = _ridges(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.resize(field, size, interpolation=cv2.INTER_NEAREST), sigma / shrink, shrink)
+        small = _ridges(cv2.resize(image, size, interpolation=cv2.INTER_AREA),
+                        cv2.resize(field, size, interpolation=cv2.INTER_NEAREST), sigma / shrink, shrink)
         return Ridges(small.points_px * shrink + (shrink - 1) / 2, small.z, small.start, shrink)
     return _ridges(image, field, sigma, 1)
 
@@ -80,7 +82,8 @@ def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> 
     noise = _noise_ratio(sigma) * 1.4826 * float(middle(np.abs(uv.ravel()[::stride][some]))) + 1e-12    # of 2 l2
     sample = l2.ravel()[::stride][some]
     enough = int((1 - min(max(shrink * MAX_RIDGE_SHARE, FEW_RIDGES / (shrink * image.size)), 0.9)) * len(sample))
-    faintest = FAINTEST * max(cv2.norm(l2, cv2.NORM_INF), float(smooth.max()) * 1e-3)           # without noise, rounding is no ridge
+    # without noise, rounding is no ridge
+    faintest = FAINTEST * max(cv2.norm(l2, cv2.NORM_INF), float(smooth.max()) * 1e-3)
     level = max(RIDGE_Z * noise, faintest, float(np.partition(sample, enough)[enough]))
     found = cv2.findNonZero(cv2.bitwise_and(cv2.compare(l2, level, cv2.CMP_GT), inside))
     if found is None:
@@ -90,14 +93,16 @@ def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> 
     gray, l2, uu, vv, uv = (a.ravel() for a in (smooth, l2, uu, vv, uv))
     strength, i_uu, i_uv, i_vv = 0.5 * l2[at], uu[at], 0.5 * uv[at], vv[at]
     big = np.abs(strength - i_vv) > np.abs(strength - i_uu)
-    nu, nv = np.where(big, strength - i_vv, i_uv), np.where(big, i_uv, strength - i_uu)     # eigenvector of l2: across the ridge
+    # eigenvector of l2: across the ridge
+    nu, nv = np.where(big, strength - i_vv, i_uv), np.where(big, i_uv, strength - i_uu)
     norm = np.hypot(nu, nv) + 1e-30
     nu, nv = nu / norm, nv / norm
     w = image.shape[1]
     gu, gv = 0.5 * (gray[at + 1] - gray[at - 1]), 0.5 * (gray[at + w] - gray[at - w])
     t = -(gu * nu + gv * nv) / strength
     du, dv = t * nu, t * nv
-    keep = np.nonzero((np.abs(du) <= NMS_PX) & (np.abs(dv) <= NMS_PX) & (np.abs(i_uu + i_vv - strength) < 0.7 * strength))[0]
+    keep = np.nonzero((np.abs(du) <= NMS_PX) & (np.abs(dv) <= NMS_PX)
+                      & (np.abs(i_uu + i_vv - strength) < 0.7 * strength))[0]
     # a dark line is darker than both its sides; the foot of a bright line or of an edge is not
     side = np.rint(2 * sigma * nv[keep]).astype(int) * w + np.rint(2 * sigma * nu[keep]).astype(int)
     rise = np.stack([gray[at[keep] + side], gray[at[keep] - side]]) - gray[at[keep]]
@@ -106,14 +111,16 @@ def _ridges(image: np.ndarray, field: np.ndarray, sigma: float, shrink: int) -> 
     index = np.full(image.size, -1, np.int32)
     index[at[keep]] = np.arange(len(keep))
     far = np.abs(t[keep])
-    beside = at[keep] + np.where(t[keep] > 0, 1, -1) * (np.rint(nv[keep]).astype(int) * w + np.rint(nu[keep]).astype(int))
+    beside = at[keep] + np.where(t[keep] > 0, 1, -1) * (np.rint(nv[keep]).astype(int) * w
+                                                        + np.rint(nu[keep]).astype(int))
     rival = index[beside]
     gone = (rival >= 0) & ((far > far[rival]) | ((far == far[rival]) & (at[keep] > beside)))
     index[at[keep[gone]]] = -1
     keep = keep[~gone]
     index[at[keep]] = np.arange(len(keep))
     points = np.stack([u[keep] + du[keep], v[keep] + dv[keep]], axis=1)
-    return _branches(points, 2 * strength[keep] / noise, _neighbour_pairs(at[keep], index, w), max(KINK_PX // shrink, 3))
+    return _branches(points, 2 * strength[keep] / noise, _neighbour_pairs(at[keep], index, w),
+                     max(KINK_PX // shrink, 3))
 
 
 def _no_ridges() -> Ridges:
@@ -121,8 +128,8 @@ def _no_ridges() -> Ridges:
 
 
 def _branches(points: np.ndarray, z: np.ndarray, pairs: np.ndarray, kink: int) -> Ridges:
-    """Cut the (M, 2) ridge points, (E, 2) of which are neighbours, at junctions and sort them along their branches; where one turns sharply within
-    `kink` points, two lines touch."""
+    """Cut the (M, 2) ridge points, (E, 2) of which are neighbours, at junctions and sort them along their branches;
+    where one turns sharply within `kink` points, two lines touch."""
     alive = np.bincount(pairs.ravel(), minlength=len(z)) <= 2
     pairs = pairs[alive[pairs].all(axis=1)]
     label, place, rings = _walk(pairs, len(z))
@@ -136,10 +143,11 @@ def _branches(points: np.ndarray, z: np.ndarray, pairs: np.ndarray, kink: int) -
 
 
 def _walk(pairs: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n,) label and (n,) place of each of n pixels along the open line it is in, -1 where it is in none; and (n,) bool: the first pixels of rings.
+    """(n,) label and (n,) place of each of n pixels along the open line it is in, -1 where it is in none; and (n,)
+    bool: the first pixels of rings.
 
-    pairs: (E, 2) neighbours, at most two a pixel. Each pair is a step either way; from step to step, then from 2nd to 2nd, 4th to 4th ... until all
-    know where they end (pointer jumping, Wyllie 1979).
+    pairs: (E, 2) neighbours, at most two a pixel. Each pair is a step either way; from step to step, then from 2nd to
+    2nd, 4th to 4th ... until all know where they end (pointer jumping, Wyllie 1979).
     """
     label, place, rings = np.full(n, -1), np.full(n, -1), np.zeros(n, bool)
     if not len(pairs):
@@ -190,7 +198,8 @@ def _split_at_kinks(points: np.ndarray, z: np.ndarray, label: np.ndarray, k: int
 def _neighbour_pairs(at: np.ndarray, index: np.ndarray, w: int) -> np.ndarray:
     """(E, 2) 8-neighbours among pixels; a diagonal only where no 4-neighbour path joins the two.
 
-    at: (M,) places in the raveled image, not at its border. index: (H * W,) which pixel is there, -1 for none. w: the image's width.
+    at: (M,) places in the raveled image, not at its border. index: (H * W,) which pixel is there, -1 for none. w: the
+    image's width.
     """
     here = np.arange(len(at), dtype=index.dtype)
     right, left, down = index[at + 1] >= 0, index[at - 1] >= 0, index[at + w] >= 0

@@ -1,4 +1,5 @@
-"""Segmentations made upstream as the method wants them: an outline is the shadow of a device that lets nothing through."""
+"""Segmentations made upstream as the method wants them: an outline is the shadow of a device that lets nothing
+through."""
 
 from __future__ import annotations
 
@@ -10,11 +11,13 @@ OPAQUE = 0.85           # share of the beam that the device takes
 LEVEL = 1000.0          # counts beside it
 BLUR, SHARPEST_PX = 0.25, 0.8   # half widths, and px at least: sigma of the blur of the shadow's edge
 THINNEST = 0.5          # of its half width, that is left of an outline however much too thick it seems
-GREYS, FULL = 8, 0.85   # so many grey levels and more, beside nearly all of the device at this share of the highest or above, are what JPEG makes of a silhouette
+GREYS, FULL = 8, 0.85   # so many grey levels and more, beside nearly all of the device at this share of the highest or
+                        # above, are what JPEG makes of a silhouette
 
 
 def outline(image: np.ndarray, half_width_px: float) -> np.ndarray:
-    """(H, W) uint8, 1 where the (H, W) silhouette of a device of this half width shows it: all but 0, without islands and holes smaller than a disc as wide as it."""
+    """(H, W) uint8, 1 where the (H, W) silhouette of a device of this half width shows it: all but 0, without islands
+    and holes smaller than a disc as wide as it."""
     found, smallest = _device(image), np.pi * half_width_px**2
     near = cv2.dilate(found, np.ones((3, 3), np.uint8))     # a thin device that is broken is no island
     _, label = cv2.connectedComponents(near, connectivity=8)
@@ -27,7 +30,8 @@ def outline(image: np.ndarray, half_width_px: float) -> np.ndarray:
 
 
 def shadow(found: np.ndarray, half_width_px: float) -> np.ndarray:
-    """(H, W) float32, the X-ray image of a dark device of this half width whose (H, W) outline is found: smoothed, and as much thicker or thinner all around."""
+    """(H, W) float32, the X-ray image of a dark device of this half width whose (H, W) outline is found: smoothed, and
+    as much thicker or thinner all around."""
     image = np.full(found.shape, LEVEL, np.float32)
     box = _around(found, int(4 * half_width_px) + 8)
     if box is None:
@@ -38,7 +42,8 @@ def shadow(found: np.ndarray, half_width_px: float) -> np.ndarray:
     inside = cv2.distanceTransform(smooth.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     seen = _half_width(inside)
     blur = max(BLUR * half_width_px, SHARPEST_PX)
-    wanted = np.sqrt(3 * (half_width_px**2 / 4 + SHARPEST_PX**2 - min(blur, half_width_px)**2))     # has, blurred, the second moment of a cylinder's shadow
+    # has, blurred, the second moment of a cylinder's shadow
+    wanted = np.sqrt(3 * (half_width_px**2 / 4 + SHARPEST_PX**2 - min(blur, half_width_px)**2))
     excess = min(seen - wanted, (1 - THINNEST) * seen)
     if excess < 0:
         device = cv2.distanceTransform((~smooth).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) < 0.5 - excess
@@ -61,9 +66,11 @@ def _device(image: np.ndarray) -> np.ndarray:
 
 
 def _half_width(inside: np.ndarray) -> float:
-    """px, of the (H, W) distance from the background in a device: the median along its middle, where that is nowhere larger."""
+    """px, of the (H, W) distance from the background in a device: the median along its middle, where that is nowhere
+    larger."""
     middle = inside[(inside > 0) & (inside >= cv2.dilate(inside, np.ones((3, 3), np.uint8)))]
-    return float(np.median(middle)) - 0.25      # to the next pixel's centre: half the width or half a px more, where that is even or odd
+    # to the next pixel's centre: half the width or half a px more, where that is even or odd
+    return float(np.median(middle)) - 0.25
 
 
 def _large(areas: np.ndarray, smallest: float) -> np.ndarray:

@@ -14,7 +14,8 @@ from ..geometry.curve import middle
 from .parallel import both
 
 TOGETHER = 25           # strips along which a structured background errs the same way
-MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over TOGETHER strips
+MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over
+                        # TOGETHER strips
 PALER, DARKER = 0.15, 4.0       # times as dark as it usually is, that a part of a device may be
 FOUND_PX = 0.3          # what `search` is worth
 MARGIN_PX = 4           # of a Sheet: interpolation reaches 2 px
@@ -34,9 +35,11 @@ class Strips:
     lit: np.ndarray         # (V, N) bool: its middle does
 
     def halves(self) -> Strips:
-        """Both halves of the N strips as if planes of their own showed them: (2 V, N / 2), both of plane A, both of plane B."""
+        """Both halves of the N strips as if planes of their own showed them: (2 V, N / 2), both of plane A, both of
+        plane B."""
         half = (2 * len(self.speed), -1)
-        return Strips(*(a.reshape(*half, *a.shape[2:]) for a in (self.centers_px, self.normals, self.speed, self.profiles)), self.offsets_px,   # type: ignore[call-arg]
+        return Strips(*(a.reshape(*half, *a.shape[2:])    # type: ignore[call-arg]
+                        for a in (self.centers_px, self.normals, self.speed, self.profiles)), self.offsets_px,
                       self.inside.reshape(half), self.lit.reshape(half))
 
 
@@ -96,7 +99,8 @@ class Sheet:
         for k, view in enumerate(self.views):
             if view.distortion is not None:
                 u[k], v[k] = _distorted(view, u[k], v[k], offsets)
-        np.minimum(np.maximum(v, -2, out=v), self.heights + 1, out=v)     # into the margin: what lies outside a plane looks like its border
+        # into the margin: what lies outside a plane looks like its border
+        np.minimum(np.maximum(v, -2, out=v), self.heights + 1, out=v)
         v += self.top
         return u, v
 
@@ -110,7 +114,8 @@ class Sheet:
 
 
 def _distorted(view: View, u: np.ndarray, v: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, W) places on strips after distortion, which over a strip is a parabola: known at three of its (W,) offsets, which are symmetric."""
+    """(N, W) places on strips after distortion, which over a strip is a parabola: known at three of its (W,) offsets,
+    which are symmetric."""
     x, at = offsets / offsets[-1], [0, len(offsets) // 2, -1]
     known = distort(view, np.stack([u[:, at], v[:, at]], axis=2).reshape(-1, 2)).reshape(-1, 3, 2).astype(np.float32)
     parabola = np.stack([x * (x - 1) / 2, 1 - x * x, x * (x + 1) / 2]).astype(np.float32)
@@ -119,7 +124,8 @@ def _distorted(view: View, u: np.ndarray, v: np.ndarray, offsets: np.ndarray) ->
 
 def _remap(image: np.ndarray, u: np.ndarray, v: np.ndarray, interpolation: int, border: int) -> np.ndarray:
     flat = -1, u.shape[-1]
-    return cv2.remap(image, u.reshape(flat), v.reshape(flat), interpolation, borderMode=border, borderValue=0).reshape(u.shape)
+    return cv2.remap(image, u.reshape(flat), v.reshape(flat), interpolation, borderMode=border,
+                     borderValue=0).reshape(u.shape)
 
 
 def cut(sheet: Sheet, points: np.ndarray, tangents: np.ndarray, reach_px: float, rough: bool = False) -> Strips:
@@ -136,8 +142,10 @@ def cut(sheet: Sheet, points: np.ndarray, tangents: np.ndarray, reach_px: float,
     return Strips(centers, normals, speed, profiles, offsets, exposed.all(axis=2), exposed[..., 1])
 
 
-def lay_out(views: Sequence[View], points: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres, normals and speed of the strips across the projections of (N, 3) points with (N, 3) tangents dX/ds, see Strips."""
+def lay_out(views: Sequence[View], points: np.ndarray,
+            tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres, normals and speed of the strips across the projections of (N, 3) points with (N, 3) tangents dX/ds, see
+    Strips."""
     P = np.stack([v.P for v in views])
     x = points @ P[:, :, :3].transpose(0, 2, 1) + P[:, None, :, 3]
     centers = x[..., :2] / x[..., 2:]
@@ -153,19 +161,24 @@ def lay_out(views: Sequence[View], points: np.ndarray, tangents: np.ndarray) -> 
 def places(centers: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(..., N, W) float32 u and v of the samples of (..., N, 2) strips at (W,) offsets."""
     centers, normals, offsets = (x.astype(np.float32) for x in (centers, normals, offsets))
-    return centers[..., 0, None] + normals[..., 0, None] * offsets, centers[..., 1, None] + normals[..., 1, None] * offsets
+    return (centers[..., 0, None] + normals[..., 0, None] * offsets,
+            centers[..., 1, None] + normals[..., 1, None] * offsets)
 
 
-def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], reach_px: float) -> tuple[Strips, np.ndarray]:
-    """Strips across (N, 2) lines of image pixels about a pixel apart, at every third; and of which line each strip is."""
+def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray],
+              reach_px: float) -> tuple[Strips, np.ndarray]:
+    """Strips across (N, 2) lines of image pixels about a pixel apart, at every third;
+    and of which line each strip is."""
     lengths = np.array([len(line) for line in lines_px])
     last = np.cumsum(lengths) - 1
-    at, of = (np.concatenate(x) for x in zip(*((np.arange(stop - n + 1, stop + 1, 3), np.full(-(-n // 3), k)) for k, (n, stop) in enumerate(zip(lengths, last)))))
+    at, of = (np.concatenate(x) for x in zip(*((np.arange(stop - n + 1, stop + 1, 3), np.full(-(-n // 3), k))
+                                               for k, (n, stop) in enumerate(zip(lengths, last)))))
     points = np.concatenate(lines_px)
     total = np.concatenate([np.zeros((1, 2)), np.cumsum(points, axis=0)])
     low, high = np.maximum(at - SMOOTHED, (last - lengths + 1)[of]), np.minimum(at + SMOOTHED, last[of])
     centers = (total[high + 1] - total[low]) / (high + 1 - low)[:, None]
-    along = (total[high + 1] - total[at]) / (high + 1 - at)[:, None] - (total[at + 1] - total[low]) / (at + 1 - low)[:, None]     # from the mean behind to that ahead
+    along = ((total[high + 1] - total[at]) / (high + 1 - at)[:, None]
+             - (total[at + 1] - total[low]) / (at + 1 - low)[:, None])     # from the mean behind to that ahead
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / (np.hypot(along[:, 0], along[:, 1]) + 1e-9)[:, None]
     offsets = np.arange(-reach_px, reach_px + 1)
     u, v = places(centers, normals, offsets)
@@ -177,7 +190,8 @@ def cut_along(image: np.ndarray, field: np.ndarray, lines_px: list[np.ndarray], 
 
 @dataclass(frozen=True)
 class Model:
-    """What a strip is made of: I = b0 + b1 x + b2 x^2 - c (T(x) - d T'(x)), background, darkness and shift of the device's profile T."""
+    """What a strip is made of: I = b0 + b1 x + b2 x^2 - c (T(x) - d T'(x)), background, darkness and shift of the
+    device's profile T."""
 
     parts: np.ndarray       # (V, W, 5)
     solve: np.ndarray       # (V, 5, W) what gives the amount of each by least squares
@@ -206,38 +220,46 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     M, fit = model.parts, model.solve
     coefficients = strips.profiles @ fit.transpose(0, 2, 1)
     rest = strips.profiles - coefficients @ M.transpose(0, 2, 1)
-    noise = (1.4826 * np.sqrt(width / (width - 5)) * middle(np.abs(rest[:, ::2]).reshape(len(rest), -1)) + 1e-9)[:, None]
+    noise = (1.4826 * np.sqrt(width / (width - 5)) * middle(np.abs(rest[:, ::2]).reshape(len(rest), -1))
+             + 1e-9)[:, None]
     inside = strips.inside
     darkness = np.where(inside, -coefficients[..., 3], np.nan)
-    usual = np.stack([_running_median(d, i) for d, i in zip(darkness, inside if reference is None else inside & reference)])
-    usual[~(usual > 1e-9)] = np.nan         # no darkness at all, or brighter than its surroundings: no device to measure
+    usual = np.stack([_running_median(d, i)
+                      for d, i in zip(darkness, inside if reference is None else inside & reference)])
+    usual[~(usual > 1e-9)] = np.nan     # no darkness at all, or brighter than its surroundings: no device to measure
     offset = coefficients[..., 4] / usual
     gain = np.sqrt((fit * fit).sum(axis=2))
     variance = (noise * gain[:, 4:] / usual) ** 2
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
     square = rest * rest
     limit = 9 * noise**2
-    misfit = cv2.blur(np.minimum(np.einsum('vnw->vn', square) / (width - 5), limit), (TOGETHER, 1), borderType=cv2.BORDER_REFLECT) / noise**2
+    misfit = cv2.blur(np.minimum(np.einsum('vnw->vn', square) / (width - 5), limit), (TOGETHER, 1),
+                      borderType=cv2.BORDER_REFLECT) / noise**2
     variance *= 1 + TOGETHER * np.maximum(misfit - MISFIT, 0)
-    odd = np.einsum('vnw->vn', np.minimum(square, limit[..., None])) > 3.5 * width * noise**2   # another edge runs through: not to be trusted
+    # another edge runs through: not to be trusted
+    odd = np.einsum('vnw->vn', np.minimum(square, limit[..., None])) > 3.5 * width * noise**2
     variance[~inside | odd | np.isnan(variance)] = np.inf
-    sigma = np.array([n * g / middle(u) if np.isfinite(u[0]) else np.inf for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
+    sigma = np.array([n * g / middle(u) if np.isfinite(u[0]) else np.inf
+                      for n, g, u in zip(noise[:, 0], gain[:, 3], usual)])
     offset[np.isnan(offset)] = 0.0
     return Measurement(offset, variance, darkness / usual, sigma, noise[:, 0], usual)
 
 
 def darkness_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
     """(N, W) how dark a line with this (w,) shadow is at each place of (N, W) float32 profiles: a matched filter."""
-    return -cv2.filter2D(profiles, cv2.CV_32F, (shadow - shadow.mean())[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE)
+    return -cv2.filter2D(profiles, cv2.CV_32F, (shadow - shadow.mean())[None].astype(np.float32),
+                         borderType=cv2.BORDER_REPLICATE)
 
 
 def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int) -> np.ndarray:
-    """(V,) how dark places farther than `beside_px` from the middle of the strips happen to look, in image values: the standard deviation, from the median
-    (which few lines there do not move), of what a line with the (V, w) `shadows` of unit depth seems to be there, averaged over `along` strips."""
+    """(V,) how dark places farther than `beside_px` from the middle of the strips happen to look, in image values: the
+    standard deviation, from the median (which few lines there do not move), of what a line with the (V, w) `shadows` of
+    unit depth seems to be there, averaged over `along` strips."""
     spread = np.empty(len(shadows))
     for v, (profiles, shape) in enumerate(zip(strips.profiles, shadows)):
         centred = shape - shape.mean()
-        dark = cv2.blur(darkness_across(profiles, shape), (1, along))[min(along // 2, len(profiles) - 1)::along] / (centred @ centred)
+        dark = (cv2.blur(darkness_across(profiles, shape), (1, along))[min(along // 2, len(profiles) - 1)::along]
+                / (centred @ centred))
         x, half = strips.offsets_px, len(shape) // 2
         beside = dark[:, (np.abs(x) > beside_px) & (np.abs(x) < x[-1] - half)]
         spread[v] = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12
@@ -245,27 +267,34 @@ def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int) -
 
 
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
-    """Where the darkest line that fits its plane's profile, a row of `shadows` (V, w), narrower than the strips, lies in each, averaged over `smooth` strips.
+    """Where the darkest line that fits its plane's profile, a row of `shadows` (V, w), narrower than the strips, lies
+    in each, averaged over `smooth` strips.
 
-    Worth FOUND_PX; worth nothing where the line found is much fainter or darker than it usually is: there something hides the device.
+    Worth FOUND_PX; worth nothing where the line found is much fainter or darker than it usually is: there something
+    hides the device.
     """
     half = (shadows.shape[1] - 1) // 2
     inner = slice(half // 2, -(half // 2) or None)
-    response = np.stack([cv2.blur(darkness_across(p, t), (1, smooth))[:, inner] for p, t in zip(strips.profiles, shadows)])
+    response = np.stack([cv2.blur(darkness_across(p, t), (1, smooth))[:, inner]
+                         for p, t in zip(strips.profiles, shadows)])
     best = np.argmax(response, axis=2)
     at = np.clip(best, 1, response.shape[2] - 2)[..., None] + np.array([-1, 0, 1])
     before, darkest, after = np.moveaxis(np.take_along_axis(response, at, axis=2), 2, 0)
-    beside = 0.5 * (before - after) / np.minimum(before - 2 * darkest + after, -1e-9)       # where the parabola through the three is highest
-    usual = np.array([max(float(middle(d[i])) if i.any() else 1.0, 1e-9) for d, i in zip(darkest, strips.inside)])[:, None]
+    # where the parabola through the three is highest
+    beside = 0.5 * (before - after) / np.minimum(before - 2 * darkest + after, -1e-9)
+    usual = np.array([max(float(middle(d[i])) if i.any() else 1.0, 1e-9)
+                      for d, i in zip(darkest, strips.inside)])[:, None]
     strength = darkest / usual
     believed = strips.inside & (strength > 0.4) & (strength < 2.5)
     unknown = np.ones(len(strength))
-    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5), np.where(believed, FOUND_PX**2, np.inf), strength, unknown, unknown,
+    return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5),
+                       np.where(believed, FOUND_PX**2, np.inf), strength, unknown, unknown,
                        np.broadcast_to(usual, strength.shape))
 
 
 def _running_median(values: np.ndarray, good: np.ndarray, width: int = 61) -> np.ndarray:
-    """(N,) typical darkness around each strip: median over blocks of `width` good strips, interpolated between them; NaN without any."""
+    """(N,) typical darkness around each strip: median over blocks of `width` good strips, interpolated between them;
+    NaN without any."""
     at = np.nonzero(good & np.isfinite(values))[0]
     if len(at) == 0:
         return np.full(len(values), np.nan)

@@ -19,9 +19,10 @@ AROUND = 12             # ... with so many strips around each, that tell whether
 def backbone(f: Fit, views: Sequence[View], forward: bool, step: float) -> Shape:
     """The fitted spline at equal arc-length steps from base to tip, with the covariance of each point.
 
-    Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of the end. What the calibration is
-    worth adds to both: the images can't tell that they lie a little beside where it says. Where the strips around a point agree that the device lies beside
-    the curve, as along the edge of a bone, that counts as much as if the calibration were off by it.
+    Across the curve it comes from the normal equations. Along it only the ends mean anything, and there it is that of
+    the end. What the calibration is worth adds to both: the images can't tell that they lie a little beside where it
+    says. Where the strips around a point agree that the device lies beside the curve, as along the edge of a bone, that
+    counts as much as if the calibration were off by it.
     """
     u = np.linspace(f.start, f.stop, max(int((f.stop - f.start) / 5e-4), 50))
     if not forward:
@@ -34,18 +35,21 @@ def backbone(f: Fit, views: Sequence[View], forward: bool, step: float) -> Shape
     n = len(f.spline.control)
     half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
     near, weights = f.spline.weights(at, 0)
-    covariance = np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near]) + _displaced(f, views, points, tangents, at)
+    covariance = (np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near])
+                  + _displaced(f, views, points, tangents, at))
     tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
     sigma = f.end_sigma[::1 if forward else -1]
     covariance[[0, -1]] += sigma[:, None, None] ** 2 * tangent[:, :, None] * tangent[:, None, :]
     known = [np.isfinite(o) for o in f.offset_px.T]
-    residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan) if k.any() else np.full(len(at), np.nan)
+    residuals = np.stack([np.interp(at, f.s[k], np.abs(o[k]), left=np.nan, right=np.nan)
+                          if k.any() else np.full(len(at), np.nan)
                           for o, k in zip(f.offset_px.T, known)], axis=1)
     return Shape(points, s, covariance, residuals)
 
 
 def _displaced(f: Fit, views: Sequence[View], points: np.ndarray, tangents: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) m^2 that planes displaced by the calibration's errors, or by what the fit leaves over, add to (N, 3) points at (N,) arc lengths.
+    """(N, 3, 3) m^2 that planes displaced by the calibration's errors, or by what the fit leaves over, add to (N, 3)
+    points at (N,) arc lengths.
 
     Between SOME of them it changes evenly.
     """

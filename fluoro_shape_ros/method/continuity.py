@@ -9,14 +9,16 @@ from ..data import Prior
 from .features import TIP
 
 FASTEST = 0.15          # m/s, that a device moves at
-LEAPS = 1.0             # 1/s: how often it is elsewhere without having been seen on its way, since the stream, the table or the patient went on
+LEAPS = 1.0             # 1/s: how often it is elsewhere without having been seen on its way, since the stream, the
+                        # table or the patient went on
 
 
 def continuity(points: np.ndarray, prior: Prior, stamp_ns: int) -> float:
-    """Nats that where the device was says for an (N, 3) curve, base to tip, in the pair of `stamp_ns`: at most 0, and 0 where that is not known.
+    """Nats that where the device was says for an (N, 3) curve, base to tip, in the pair of `stamp_ns`: at most 0, and 0
+    where that is not known.
 
-    Within t it moves by FASTEST t + TIP, as a Gaussian has it beyond that, unless it has leapt, with the probability 1 - exp(-LEAPS t). So what is found
-    elsewhere an eye-blink later needs more evidence, and some time later none.
+    Within t it moves by FASTEST t + TIP, as a Gaussian has it beyond that, unless it has leapt, with the probability
+    1 - exp(-LEAPS t). So what is found elsewhere an eye-blink later needs more evidence, and some time later none.
     """
     if prior.previous is None or prior.previous_stamp_ns is None or stamp_ns <= prior.previous_stamp_ns:
         return 0.0

@@ -1,6 +1,7 @@
 """What the images say of a fitted curve, in terms that mean the same on any display and at any dose.
 
-How dark a line is on the curve is compared with how dark places beside it happen to be, so that gain, offset and noise cancel; all else is a ratio, or in px.
+How dark a line is on the curve is compared with how dark places beside it happen to be, so that gain, offset and noise
+cancel; all else is a ratio, or in px.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from ..imaging.strips import Sheet, Strips, cut
 from .fit.fit import MAX_HALF_WIDTH_PX, Fit
 
 BLOCK = 12              # strips, along which darkness is averaged
-WIDER, BLUR_PX = 1.2, 1.0       # half a line's width is taken as so many times that of the device, and so much more for blur
+WIDER, BLUR_PX = 1.2, 1.0  # half a line's width is taken as so many times that of the device, and so much more for blur
 PAST = 18               # strips looked at past either end
 CLEAR = 2.5             # signal to noise, at which a block is darker than nearly all places beside the curve
-MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose closest-point mean is within the larger of these ...
+MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose closest-point mean is within the larger
+                                # of these ...
 TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 PARTS, FEW = 3, 3       # of a device that are looked at apart for its width, of so many blocks at least
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
@@ -31,12 +33,14 @@ SKETCHED_PX = 2         # between the strips of a curve that was not fitted
 
 @dataclass(frozen=True)
 class Features:
-    """Of one fit; of both planes the one that speaks against it, of both ends the tip's apart. Names are those in words of judge.REASONS."""
+    """Of one fit; of both planes the one that speaks against it, of both ends the tip's apart. Names are those in words
+    of judge.REASONS."""
 
     weakest: float      # ln of the lowest signal to noise of three blocks in a row
     seen: float         # share of the blocks darker than nearly all places beside the curve
     symmetric: float    # odd part of the mean profile, as a share of its even part
-    wide: float         # ln of the width seen to that expected, of the part where that is nearest to none, where it is wider ...
+    wide: float         # ln of the width seen to that expected, of the part where that is nearest to none,
+                        # where it is wider ...
     narrow: float       # ... and the other way round
     residual: float     # px rms, of the device from the curve
     sigma: float        # ln of the curve's, as a share of what it may be off by
@@ -44,7 +48,8 @@ class Features:
     tip_shown: float    # darkness of its last BLOCK before the tip, as a share of its darkness
     base_stops: float   # as tip_stops
     tip_sigma: float    # ln of the tip's along the curve, as a share of what it may be off by
-    tip_aside: float    # darkness of a line beside where it would go on, beyond what places beside it happen to look like
+    tip_aside: float    # darkness of a line beside where it would go on, beyond what places beside it happen to look
+                        # like
     tip_farther: float  # nats by which both planes show it going on past its tip
     no_tip: float       # 1 where it leaves the field at both ends
     length: float       # ln of the share of an image's diagonal
@@ -68,15 +73,18 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
     return np.array([
         *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
-        stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, np.clip((fit.aside[tip] - BY_CHANCE * fit.clutter).max(), 0.0, 2.0),
-        min(fit.farther[tip], FARTHEST), fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
+        stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma,
+        np.clip((fit.aside[tip] - BY_CHANCE * fit.clutter).max(), 0.0, 2.0), min(fit.farther[tip], FARTHEST),
+        fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
 
 
 def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarray:
-    """(len(NAMES),) of a curve (N, 3) in m, known to a few px, that was not fitted: NaN for what that cannot tell yet."""
+    """(len(NAMES),) of a curve (N, 3) in m, known to a few px, that was not fitted: NaN for what that cannot tell
+    yet."""
     scale = [pixels_per_metre(v.P, points) for v in sheet.views]
     if radius * max(scale) > MAX_HALF_WIDTH_PX or min(depth(v.P, points).min() for v in sheet.views) <= 0:
-        return np.array([dict(weakest=np.log(FAINTEST), seen=0.0).get(name, np.nan) for name in NAMES])     # it goes to a source
+        # it goes to a source
+        return np.array([dict(weakest=np.log(FAINTEST), seen=0.0).get(name, np.nan) for name in NAMES])
     step = SKETCHED_PX / max(scale)
     spline = through(points, 0.0)
     seen, count = _seen(spline, spline.start, spline.stop, step, sheet, radius, round(BLOCK / SKETCHED_PX))
@@ -84,8 +92,10 @@ def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarra
     return np.array([known.get(name, np.nan) for name in NAMES])
 
 
-def _seen(spline: Spline3, start: float, stop: float, step: float, sheet: Sheet, radius: float, block: int = BLOCK) -> tuple[list[dict], int]:
-    """What each plane shows of a curve between two arc lengths, and the number of strips between them, `step` m apart and `block` of them in a block."""
+def _seen(spline: Spline3, start: float, stop: float, step: float, sheet: Sheet, radius: float,
+          block: int = BLOCK) -> tuple[list[dict], int]:
+    """What each plane shows of a curve between two arc lengths, and the number of strips between them, `step` m apart
+    and `block` of them in a block."""
     count = max(int((stop - start) / step), block)
     s = np.linspace(start, stop, count)
     s = np.concatenate([start + step * np.arange(-PAST, 0), s, stop + step * np.arange(1, PAST + 1)])
@@ -103,12 +113,13 @@ def _diagonal_px(sheet: Sheet) -> float:
 def _everywhere(seen: list[dict]) -> tuple[float, ...]:
     """The features of what each plane shows along all of a curve, in the order of NAMES."""
     width = np.array([p['width'] for p in seen])
-    return (np.log(np.clip(min(p['run'] for p in seen), FAINTEST, CLEAREST)), min(p['share'] for p in seen), max(p['odd'] for p in seen),
-            max(width.max(), 0.0), max(-width.min(), 0.0))
+    return (np.log(np.clip(min(p['run'] for p in seen), FAINTEST, CLEAREST)), min(p['share'] for p in seen),
+            max(p['odd'] for p in seen), max(width.max(), 0.0), max(-width.min(), 0.0))
 
 
 def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, block: int) -> dict:
-    """What plane `v` shows of a curve with `count` strips, `block` of them in a block, and PAST more past either end."""
+    """What plane `v` shows of a curve with `count` strips, `block` of them in a block, and PAST more past either
+    end."""
     x, profiles = strips.offsets_px, strips.profiles[v]
     flank = (np.abs(x) > half + 0.5) & (np.abs(x) <= 2 * half + 2)
     width = int(np.ceil(2 * half + 2))
@@ -133,16 +144,20 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, bl
     odd, odd_error = _typical(0.5 * (shadow - shadow[:, ::-1]))
     # tubes that end make steps: the part that comes nearest to the radius counts
     parts = np.array_split(shadow, PARTS) if number >= PARTS * FEW else [shadow]
-    width = min((_width(p, x[near]) / np.hypot(radius_px / 2, BLUR_PX) for p in parts), key=lambda w: abs(np.log(max(w, 1e-3))))
+    width = min((_width(p, x[near]) / np.hypot(radius_px / 2, BLUR_PX) for p in parts),
+                key=lambda w: abs(np.log(max(w, 1e-3))))
     each = dark[:, np.abs(x) <= 1].max(axis=1) / usual
-    ends = [(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()), (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())]
+    ends = [(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()),
+            (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())]
     odd_share = np.sqrt(max((odd**2 - odd_error**2).sum(), 0.0) / ((even**2).sum() + 1e-12))
-    return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0), width=float(np.log(np.clip(width, 0.3, 3.0))),
+    return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0),
+                width=float(np.log(np.clip(width, 0.3, 3.0))),
                 stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))
 
 
 def _width(shadow: np.ndarray, x: np.ndarray) -> float:
-    """Standard deviation in px of the shadows (N, W) at (W,) offsets, as far as they are clear; a cylinder's chords have half its radius."""
+    """Standard deviation in px of the shadows (N, W) at (W,) offsets, as far as they are clear; a cylinder's chords
+    have half its radius."""
     even, error = _typical(0.5 * (shadow + shadow[:, ::-1]))
     positive = even * (even > 2 * error)
     return float(np.sqrt((positive * x**2).sum() / (positive.sum() + 1e-12)))

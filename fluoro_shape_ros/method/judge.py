@@ -1,13 +1,16 @@
-"""How likely a fitted curve is right: one calibrated model of what the images say of it, and the words for what speaks against it.
+"""How likely a fitted curve is right: one calibrated model of what the images say of it, and the words for what speaks
+against it.
 
-Logistic regression (Cox 1958) on how much worse each feature x is than it typically is of right curves, in scales that they differ by,
+Logistic regression (Cox 1958) on how much worse each feature x is than it typically is of right curves, in scales that
+they differ by,
 
     u_k = min(max(sign_k (typical_k - x_k) / scale_k, 0), LIMIT)
     ln odds = bias - sum_k (near_k max(u_k - NEAR, 0) + far_k max(u_k - FAR, 0)),     near_k, far_k >= 0,
 
 so that nothing makes up for what speaks against a curve: a tip that is uncertain stays so however dark the device is.
-The coefficients stand in resource/judge.json, made by `fluoro_shape_bench judge` from seeded scenes that are named there. The best of several curves is
-right with the probability that `search.choose` gives, once more calibrated: ln odds -> offset + slope ln odds (Platt 1999).
+The coefficients stand in resource/judge.json, made by `fluoro_shape_bench judge` from seeded scenes that are named
+there. The best of several curves is right with the probability that `search.choose` gives, once more calibrated: ln
+odds -> offset + slope ln odds (Platt 1999).
 """
 
 from __future__ import annotations
@@ -23,10 +26,11 @@ from .features import NAMES
 
 BEYOND_DOUBT = 0.97     # confidence from which on nothing else is tried, unless min_confidence asks for more
 PREDICTED = 1.0         # what a prediction that a curve bears out adds to its log odds
-NEAR, FAR, LIMIT = 0.7, 2.0, 6.0        # scales: what is worse by less says nothing, by more it says more, and in the end no more
+# scales: what is worse by less says nothing, by more it says more, and in the end no more
+NEAR, FAR, LIMIT = 0.7, 2.0, 6.0
 # +1: the more the likelier it is right, -1: the less
-SIGNS = dict(weakest=1, seen=1, symmetric=-1, wide=-1, narrow=-1, residual=-1, sigma=-1, tip_stops=1, tip_shown=1, base_stops=1,
-             tip_sigma=-1, tip_aside=-1, tip_farther=-1, no_tip=-1, length=1, hidden=-1)
+SIGNS = dict(weakest=1, seen=1, symmetric=-1, wide=-1, narrow=-1, residual=-1, sigma=-1, tip_stops=1, tip_shown=1,
+             base_stops=1, tip_sigma=-1, tip_aside=-1, tip_farther=-1, no_tip=-1, length=1, hidden=-1)
 REASONS = dict(
     weakest='part of it hardly stands out from what lies beside it',
     seen='one plane does not show all of it', symmetric='one side of it is darker than the other, as at an edge',

@@ -1,5 +1,5 @@
-"""Places of a fitted device that each plane shows by itself, whatever the other plane's calibration: its ends, its steps and bands, and where it runs along its
-epipolar line.
+"""Places of a fitted device that each plane shows by itself, whatever the other plane's calibration: its ends, its
+steps and bands, and where it runs along its epipolar line.
 
 A fit takes up an error of the calibration elsewhere: it moves in depth until it lies on the device in both images.
 """
@@ -30,7 +30,8 @@ ALIKE = 0.5             # correlation of both planes' bands, from which on they 
 STEPS_PX = 0.8          # what bands tell of that (measured)
 ENDS = 20               # strips, that are left out of the bands
 
-Place = tuple[str, np.ndarray, np.ndarray, np.ndarray]     # kind, (2,) px in plane A, in plane B, and (2,) slack, see Landmarks
+# kind, (2,) px in plane A, in plane B, and (2,) slack, see Landmarks
+Place = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 
 
 def landmarks(f: Fit, views: Sequence[View], tip_is_last: bool) -> Landmarks:
@@ -46,12 +47,13 @@ def _ends(f: Fit, views: Sequence[View], tip_is_last: bool) -> Iterator[Place]:
     for k, outward in enumerate((-1, 1)):
         if f.seen_at is None or f.seen_sigma is None or not np.isfinite([f.seen_at[k], f.seen_sigma[k]]).all():
             continue
-        centers, normals, speed = lay_out(views, *f.spline.lines(f.seen_at[k]))       # strip v where plane v sees the end
+        centers, normals, speed = lay_out(views, *f.spline.lines(f.seen_at[k]))     # strip v where plane v sees the end
         if (np.abs(f.seen_at[k] - (f.start, f.stop)[k]) * np.diag(speed) > FAR_PX).any():
             continue
         near = np.argsort(np.abs(f.s - np.clip(f.seen_at[k].mean(), f.start, f.stop)))[:AROUND]
         a, b = (centers[v, v] + normals[v, v] * _usual(f.offset_px[near, v]) for v in (0, 1))
-        yield 'tip' if k == int(tip_is_last) else 'base', a, b, outward * _tangents(normals[1, 1]) * speed[1, 1] * np.hypot(*f.seen_sigma[k])
+        yield ('tip' if k == int(tip_is_last) else 'base', a, b,
+               outward * _tangents(normals[1, 1]) * speed[1, 1] * np.hypot(*f.seen_sigma[k]))
 
 
 def _along(f: Fit, views: Sequence[View], F: np.ndarray) -> Iterator[Place]:
@@ -77,12 +79,14 @@ def _along(f: Fit, views: Sequence[View], F: np.ndarray) -> Iterator[Place]:
 
 
 def _bands_apart(f: Fit, across: np.ndarray) -> float | None:
-    """px across the epipolar lines by which plane B shows the device's bands and steps from where plane A does; None where there are none.
+    """px across the epipolar lines by which plane B shows the device's bands and steps from where plane A does; None
+    where there are none.
 
     across: (N,) px per m that its image in plane B runs across them.
     """
     step = f.s[1] - f.s[0]
-    counts = (f.s > f.start + ENDS * step) & (f.s < f.stop - ENDS * step) & (np.abs(across) > ACROSS_LINE * np.abs(across).max())
+    counts = ((f.s > f.start + ENDS * step) & (f.s < f.stop - ENDS * step)
+              & (np.abs(across) > ACROSS_LINE * np.abs(across).max()))
     if counts.sum() < 4 * BROAD:
         return None
     dark = np.where(np.isfinite(f.presence), np.clip(f.presence, -1, 4), 1.0)

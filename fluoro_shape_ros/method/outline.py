@@ -1,7 +1,8 @@
-"""A fit measured once more on the outlines that were segmented: how they scatter says how uncertain it is, and their ends are what they are.
+"""A fit measured once more on the outlines that were segmented: how they scatter says how uncertain it is, and their
+ends are what they are.
 
-Of an opaque device the outline reaches beyond the end of its axis by half the ellipse that a flat end's rim is, seen at an angle, and by as much as it is
-too thick.
+Of an opaque device the outline reaches beyond the end of its axis by half the ellipse that a flat end's rim is, seen at
+an angle, and by as much as it is too thick.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ from ..imaging.strips import Model, Sheet, Strips, cut, measure, search
 from .fit.fit import Fit
 from .fit.solver import Layout, solve
 
-LOOKS = search, measure, measure        # across the curve: a sharp edge tells how far it is off only where that is not far
+LOOKS = search, measure, measure    # across the curve: a sharp edge tells how far it is off only where that is not far
 FOUND_OVER = 5          # strips, together, in which the device is looked for first
 EDGE_PX = 0.5           # blur of an outline's edge, sampled between pixels
-BESIDE_PX, LONGEST_PX = 60, 400 # along the curve, at least and at most, that tell how thick and jagged an outline is beside its end
+# along the curve, at least and at most, that tell how thick and jagged an outline is beside its end
+BESIDE_PX, LONGEST_PX = 60, 400
 FEWEST = 20             # strips that do
 GONE = 0.3              # of the width: more is left where an outline goes on
 TOO_THICK_PX = 1.5      # standard deviation of what an outline is too thick or too thin ...
@@ -31,13 +33,16 @@ RADIUS_OFF = 0.1        # ... and of what is known of the device's radius, as a 
 PIXEL_PX = 0.3          # what the end of an outline of pixels is worth at best
 RIM = 0.15              # share of the rim that its model is worth
 CORNER_PX = 1.0         # by which a segmentation makes corners round
-ROUND_PX, SURE = 6.0, 5.0       # from which half width on a round end is told from corners that are, and nats that must speak for two; twice as many for one
+# from which half width on a round end is told from corners that are, and nats that must speak for two;
+# twice as many for one
+ROUND_PX, SURE = 6.0, 5.0
 TOGETHER_PX = 3.0       # along which an outline's edge errs the same way
 FINE_PX = 0.2           # steps in which an end is looked for
 
 
 def on_outlines(outlines: Sheet, f: Fit, radius: float) -> Fit:
-    """The fit brought to rest on the outlines (1 in the device, 0 beside it) of a device of `radius` m; itself where they show nothing along it."""
+    """The fit brought to rest on the outlines (1 in the device, 0 beside it) of a device of `radius` m; itself where
+    they show nothing along it."""
     for look in LOOKS:
         settled = _across(outlines, f, radius, look)
         if settled is None:
@@ -63,7 +68,8 @@ def _across(outlines: Sheet, f: Fit, radius: float, look: Callable) -> Fit | Non
     else:
         measured = measure(dark, Model.of(profile, x), within)
     solution = solve(layout, f.spline, dark, measured, outlines.views, within)
-    return replace(f, spline=solution.spline, covariance=solution.covariance(), s=layout.s, offset_px=solution.offset_px.T)
+    return replace(f, spline=solution.spline, covariance=solution.covariance(), s=layout.s,
+                   offset_px=solution.offset_px.T)
 
 
 def _cut(outlines: Sheet, points: np.ndarray, tangents: np.ndarray, radius: float) -> Strips:
@@ -95,7 +101,7 @@ def _ended(outlines: Sheet, f: Fit, radius: float) -> Fit:
     """The fit with its ends where the outlines show them; where these do not, as they were."""
     ends = [[] if f.open_end[k] else _seen(outlines, f, radius, k) for k in (0, 1)]
     speak = [sum(e.round if e.outline > ROUND_PX else -SURE for e in seen) for seen in ends]
-    drawn = all(ends) and sum(speak) > SURE and min(speak) > -SURE      # with a round brush, from end to end of the axis
+    drawn = all(ends) and sum(speak) > SURE and min(speak) > -SURE  # with a round brush, from end to end of the axis
     at, sigma, alone = np.array([f.start, f.stop]), f.end_sigma.copy(), f.alone.copy()
     seen_at, seen_sigma = np.full((2, 2, 2), np.nan)
     for k, (seen, outward) in enumerate(zip(ends, (-1, 1))):
@@ -108,7 +114,8 @@ def _ended(outlines: Sheet, f: Fit, radius: float) -> Fit:
                 seen_at[k], seen_sigma[k] = at[k] + outward * by_each[:, 0], by_each[:, 1]
             at[k] += outward * past
             alone[k] = -1 if len(seen) == 2 else alone[k]
-    ended = replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma, alone=alone, seen_at=seen_at, seen_sigma=seen_sigma)
+    ended = replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma, alone=alone, seen_at=seen_at,
+                    seen_sigma=seen_sigma)
     return ended if at[1] - at[0] > radius else replace(f, seen_at=None, seen_sigma=None)
 
 
@@ -117,7 +124,8 @@ def _seen(outlines: Sheet, f: Fit, radius: float, k: int) -> list[_Seen]:
     views, step, end, outward = outlines.views, f.s[1] - f.s[0], (f.start, f.stop)[k], (-1, 1)[k]
     scale = [pixels_per_metre(v.P, f.spline(np.array([end]))) for v in views]
     half_width = radius * max(scale)
-    inner, outer = int(1.5 * half_width + 6), int(3 * half_width + 14)      # strips before the end and past it, among which the outline may end
+    # strips before the end and past it, among which the outline may end
+    inner, outer = int(1.5 * half_width + 6), int(3 * half_width + 14)
     count = min(inner + max(BESIDE_PX, min(int(8 * half_width), LONGEST_PX)), int((f.stop - f.start) / step))
     first = count - inner
     if first < FEWEST:
@@ -125,7 +133,8 @@ def _seen(outlines: Sheet, f: Fit, radius: float, k: int) -> list[_Seen]:
     past = step * np.arange(-count, outer)
     on = np.clip(end + outward * past, f.start, f.stop)
     points, tangents = f.spline.lines(on)
-    strips = _cut(outlines, points + (end + outward * past - on)[:, None] * tangents, tangents, radius)     # straight on past the end
+    # straight on past the end
+    strips = _cut(outlines, points + (end + outward * past - on)[:, None] * tangents, tangents, radius)
     found = []
     for v, width in enumerate(_widths(strips)):
         usual, speed = float(middle(width[:first])), float(strips.speed[v, count])
@@ -138,20 +147,24 @@ def _seen(outlines: Sheet, f: Fit, radius: float, k: int) -> list[_Seen]:
         rim = device * np.sqrt(1 - np.clip(speed / scale[v], 0.2, 1.0)**2)
         corner = min(max(excess, 0) + CORNER_PX, h / 2)
         px = past[first:] * speed
-        (flat, cost), (centre, cost_round) = (_where(px, share[first:], _end_of(h, *shape)) for shape in ((rim, corner), (h, 0.0)))
+        (flat, cost), (centre, cost_round) = (_where(px, share[first:], _end_of(h, *shape))
+                                              for shape in ((rim, corner), (h, 0.0)))
         noise = max(float(np.var(share[:first])), (PIXEL_PX / usual)**2)
-        found.append(_Seen((flat + corner - excess) / speed, centre / speed, (cost - cost_round) / (2 * TOGETHER_PX * noise), h, device,
-                           float(np.hypot(PIXEL_PX, _jagged(strips.profiles[v, :first], usual / (step * speed)))), RIM * rim,
-                           TOO_THICK_PX * off / np.hypot(TOO_THICK_PX, off), speed))
+        found.append(_Seen((flat + corner - excess) / speed, centre / speed,
+                           (cost - cost_round) / (2 * TOGETHER_PX * noise), h, device,
+                           float(np.hypot(PIXEL_PX, _jagged(strips.profiles[v, :first], usual / (step * speed)))),
+                           RIM * rim, TOO_THICK_PX * off / np.hypot(TOO_THICK_PX, off), speed))
     return found
 
 
 def _end_of(half_width: float, rim: float, corner: float) -> np.ndarray:
-    """(N,) width, as a share, of an outline at px FINE_PX apart, centred on 0, from which on it gets narrower: a cylinder's end, of whose rim an ellipse is seen
-    that reaches so far, drawn with a pen that makes corners so round (a Minkowski sum, by its normals)."""
+    """(N,) width, as a share, of an outline at px FINE_PX apart, centred on 0, from which on it gets narrower: a
+    cylinder's end, of whose rim an ellipse is seen that reaches so far, drawn with a pen that makes corners so round (a
+    Minkowski sum, by its normals)."""
     a, b, normal = rim, half_width - corner, np.linspace(0, np.pi / 2, 200)
     across = np.sqrt((a * np.cos(normal))**2 + (b * np.sin(normal))**2) + 1e-9
-    x, y = a * a * np.cos(normal) / across + corner * np.cos(normal), b * b * np.sin(normal) / across + corner * np.sin(normal)
+    x, y = (a * a * np.cos(normal) / across + corner * np.cos(normal),
+            b * b * np.sin(normal) / across + corner * np.sin(normal))
     reach = FINE_PX * np.ceil((rim + corner + 4) / FINE_PX)
     at = np.arange(-reach, reach + FINE_PX / 2, FINE_PX)
     width = np.where(at < 0, 1.0, np.interp(at, x[::-1], y[::-1], right=0.0) / half_width)
@@ -159,7 +172,8 @@ def _end_of(half_width: float, rim: float, corner: float) -> np.ndarray:
 
 
 def _where(px: np.ndarray, share: np.ndarray, shape: np.ndarray) -> tuple[float, float]:
-    """Where `shape` (_end_of) is most like (N,) widths, as shares, at (N,) px, by least squares; and the sum of their squares."""
+    """Where `shape` (_end_of) is most like (N,) widths, as shares, at (N,) px, by least squares; and the sum of their
+    squares."""
     reach = FINE_PX * (len(shape) // 2)
     places = np.arange(px[0], px[-1], FINE_PX)
     model = np.interp(px - places[:, None], np.linspace(-reach, reach, len(shape)), shape)
@@ -169,7 +183,8 @@ def _where(px: np.ndarray, share: np.ndarray, shape: np.ndarray) -> tuple[float,
 
 
 def _jagged(profiles: np.ndarray, count: float) -> float:
-    """px: standard deviation of an outline's edge, averaged over `count` of its (N, W) strips, as an end is over its width."""
+    """px: standard deviation of an outline's edge, averaged over `count` of its (N, W) strips, as an end is over its
+    width."""
     inside, half = np.minimum(np.maximum(profiles, 0), 1), profiles.shape[1] // 2
     sides = np.stack([inside[:, :half].sum(axis=1), inside[:, half + 1:].sum(axis=1)])
     mean = cv2.blur(sides - sides.mean(axis=1, keepdims=True), (max(round(count), 1), 1))
@@ -185,8 +200,9 @@ def _joint(seen: list[_Seen], apex: float | None) -> tuple[float, float]:
     if apex is None:
         past, own, common = np.array([(e.flat, np.hypot(e.sigma, e.flat_sigma), e.common) for e in seen]).T
     else:
-        past, own, common = np.array([(e.centre + apex * e.device / e.speed, e.sigma, 0.5 * e.device * (apex == 0.5)) for e in seen]).T
+        past, own, common = np.array([(e.centre + apex * e.device / e.speed, e.sigma, 0.5 * e.device * (apex == 0.5))
+                                      for e in seen]).T
     own, common = own / speed, common / speed
     weight = 1 / own**2 / np.sum(1 / own**2)
-    apart = float(((past - weight @ past)**2 / own**2).sum())      # chi-squared with one degree of freedom, of two outlines
+    apart = float(((past - weight @ past)**2 / own**2).sum())  # chi-squared with one degree of freedom, of two outlines
     return float(weight @ past), float(np.hypot(np.sqrt(max(1.0, apart) / np.sum(1 / own**2)), weight @ common))

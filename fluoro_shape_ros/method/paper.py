@@ -28,8 +28,10 @@ END_PX = 5.0
 
 
 def segment(image: np.ndarray, half_width_px: float, min_length_px: float) -> np.ndarray:
-    """(N, 2) centreline in px of the largest curve in the (H, W) image of a dark device, or (0, 2) where there is none."""
-    from skimage.morphology import thin  # here: the node's default method needs no scikit-image, and starts faster without
+    """(N, 2) centreline in px of the largest curve in the (H, W) image of a dark device, or (0, 2) where there is
+    none."""
+    # here: the node's default method needs no scikit-image, and starts faster without
+    from skimage.morphology import thin
     image = image.astype(np.float32)
     filtered = vesselness(wiener(image), [max(1.0, half_width_px * k) for k in SCALES])
     binary = filtered > filtered.mean()             # "thresholded by the mean intensity"
@@ -37,7 +39,8 @@ def segment(image: np.ndarray, half_width_px: float, min_length_px: float) -> np
 
 
 def wiener(image: np.ndarray) -> np.ndarray:
-    """Pixel-wise adaptive Wiener filter over a 6x6 neighbourhood; the noise power is the mean of the local variances (Lim 1990, as in Matlab's wiener2)."""
+    """Pixel-wise adaptive Wiener filter over a 6x6 neighbourhood; the noise power is the mean of the local variances
+    (Lim 1990, as in Matlab's wiener2)."""
     box = (WIENER_PX, WIENER_PX)
     mean = cv2.boxFilter(image, cv2.CV_32F, box, borderType=cv2.BORDER_REFLECT)
     variance = np.maximum(cv2.boxFilter(image * image, cv2.CV_32F, box, borderType=cv2.BORDER_REFLECT) - mean * mean, 0)
@@ -60,7 +63,8 @@ def vesselness(image: np.ndarray, scales_px: list[float]) -> np.ndarray:
 
 
 def longest_curve(skeleton: np.ndarray, min_length_px: float) -> np.ndarray:
-    """(N, 2) pixels along the largest connected skeleton from end to end; (0, 2) when all have fewer than `min_length_px` pixels.
+    """(N, 2) pixels along the largest connected skeleton from end to end; (0, 2) when all have fewer than
+    `min_length_px` pixels.
 
     open: the paper does not say how branches are left out; here the longest shortest path counts.
     """
@@ -95,7 +99,8 @@ def _neighbours(u: np.ndarray, v: np.ndarray, shape: tuple[int, int]) -> coo_mat
         rows += [here, other[here]]
         cols += [other[here], here]
         weights += [np.full(2 * len(here), np.hypot(du, dv))]
-    return coo_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(cols))), shape=(len(u), len(u))).tocsr()
+    return coo_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(cols))),
+                      shape=(len(u), len(u))).tocsr()
 
 
 def control_points(centerline_px: np.ndarray, spacing_px: float) -> np.ndarray:
@@ -107,9 +112,10 @@ def control_points(centerline_px: np.ndarray, spacing_px: float) -> np.ndarray:
 def correspond(points_px: np.ndarray, curve_px: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M,) indices of the points whose epipolar line meets the other image's curve, and (M, 2) where.
 
-    points_px: (N, 2), curve_px: (K, 2), both along the device in the same direction; F maps the points' image to the curve's.
-    open: of several intersections the one at the most similar share of the length counts; an end whose line passes the other curve's end
-    within END_PX corresponds to it.
+    points_px: (N, 2), curve_px: (K, 2), both along the device in the same direction; F maps the points' image to the
+    curve's.
+    open: of several intersections the one at the most similar share of the length counts; an end whose line passes the
+    other curve's end within END_PX corresponds to it.
     """
     lines = epipolar_lines(F, points_px)
     distance = lines[:, :2] @ curve_px.T + lines[:, 2:]                 # (N, K) px
@@ -135,8 +141,10 @@ def same_direction(a_px: np.ndarray, b_px: np.ndarray, F: np.ndarray) -> bool:
     return bool(d[0, 0] + d[1, 1] <= d[0, 1] + d[1, 0])
 
 
-def reconstruct_curves(views: Sequence[View], centerlines_px: tuple[np.ndarray, np.ndarray], spacing_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """The two estimates of the space curve, from plane A's control points and from plane B's: (N, 3) and (M, 3) in m, same direction."""
+def reconstruct_curves(views: Sequence[View], centerlines_px: tuple[np.ndarray, np.ndarray],
+                       spacing_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """The two estimates of the space curve, from plane A's control points and from plane B's: (N, 3) and (M, 3) in m,
+    same direction."""
     a, b = (undistort(v, c) for v, c in zip(views, centerlines_px))
     Pa, Pb = (v.P for v in views)
     F = fundamental(Pa, Pb)

@@ -34,13 +34,16 @@ from .user_bounds import check_curvature, check_length, check_reprojection, chec
 
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
 CURVE = 400             # points of a fit, that its darkness is looked at along
-OPEN = {Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B, Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE}     # what a longer search might have answered
+# what a longer search might have answered
+OPEN = {Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B, Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE}
 
 
 def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: float | None = None) -> Reconstruction:
-    """The backbone seen in a pair of images, or the reason why there is none. Pure: the same pair gives the same answer.
+    """The backbone seen in a pair of images, or the reason why there is none. Pure: the same pair gives the same
+    answer.
 
-    until: time.monotonic() from which on no other hypothesis is tried, and what was found by then is judged; None: no limit, and the same answer on any machine.
+    until: time.monotonic() from which on no other hypothesis is tried, and what was found by then is judged; None: no
+    limit, and the same answer on any machine.
     """
     clock = _Stopwatch(until)
     try:
@@ -53,17 +56,20 @@ def reconstruct(frame: Frame, config: Config, prior: Prior = Prior(), until: flo
         config = config.replace(polarity='dark')
         by = by if by is _by_paper else partial(by, measured=partial(on_outlines, outlines, radius=config.radius))
     else:
-        images = frame.images if prior.masks is None else tuple(subtract(i, m) for i, m in zip(frame.images, prior.masks))
-        fields = both(partial(common_field, polarity=config.detection.polarity), frame.images, prior.masks or (None, None),
+        images = frame.images if prior.masks is None else tuple(subtract(i, m)
+                                                                for i, m in zip(frame.images, prior.masks))
+        fields = both(partial(common_field, polarity=config.detection.polarity), frame.images,
+                      prior.masks or (None, None),
                       pixels=sum(image.size for image in frame.images) // 4)     # it halves them first
     clock.lap('prepare')
     guess, why = look(prior, frame.views, config.curve.prior_sigma)
     return judged(_in_time(by(frame, images, fields, config, prior, guess, clock), clock), guess, why)
 
 
-def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None, clock: _Stopwatch,
-               measured: Callable[[Fit], Fit] = lambda f: f) -> Reconstruction:
-    """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search of the whole images.
+def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior,
+               guess: Guess | None, clock: _Stopwatch, measured: Callable[[Fit], Fit] = lambda f: f) -> Reconstruction:
+    """method:=spline: both images are fitted at once, from where the device was or is predicted to be, or from a search
+    of the whole images.
 
     measured: what is made of a Fit before it is judged.
     """
@@ -73,8 +79,8 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     model = judge.load()
 
     def sized_up(sheet: Sheet, f: Fit) -> tuple[np.ndarray, float, bool]:
-        """Features of a fit and its log odds, with what a prediction that it bears out, the device's description and where it was say; and whether its last
-        end is the tip."""
+        """Features of a fit and its log odds, with what a prediction that it bears out, the device's description and
+        where it was say; and whether its last end is the tip."""
         alike = _alike(f.curve(CURVE), sheet, config)
         last, _ = tip(f, alike)
         seen = features(f, sheet, radius, last)
@@ -95,7 +101,8 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
         sheet = sheet_of(images, fields, frame.views, polarity)
         sized = partial(sized_up, sheet)
         if prior.search is None or guess is not None:
-            search = Search(sheet, radius, config.detection.min_length_px, sized, lambda odds: model.settles(odds, enough), guess, leads,
+            search = Search(sheet, radius, config.detection.min_length_px, sized,
+                            lambda odds: model.settles(odds, enough), guess, leads,
                             lambda points: float(model.log_odds(at_first_sight(points, sheet, radius))), measured)
             search.go_on(clock.late)
             tried = search.tried
@@ -119,7 +126,8 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     against, words = verdict(config.described, alike, f, last, config.detection.device)
     if against > min(CONTRADICTS, model.terms(chosen.features).min()):
         words = model.why(chosen.features, chosen.log_odds, p)
-    if continuity(f.curve(100)[::1 if last else -1], prior, frame.stamp_ns) < min(model.terms(chosen.features).min(), against):
+    if continuity(f.curve(100)[::1 if last else -1], prior, frame.stamp_ns) < min(model.terms(chosen.features).min(),
+                                                                                  against):
         words = 'it is far from where it was just before'
     if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)
@@ -127,12 +135,14 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     clock.lap('backbone')
     doubt = (Outcome.LOW_CONFIDENCE, words) if confidence < least else _doubt(shape, config, frame)
     if doubt:
-        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence, search=unfinished, landmarks=places)
-    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence, landmarks=places)
+        return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence,
+                              search=unfinished, landmarks=places)
+    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps,
+                          confidence=confidence, landmarks=places)
 
 
-def _near(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None,
-          clock: _Stopwatch) -> Iterator[Near]:
+def _near(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior,
+          guess: Guess | None, clock: _Stopwatch) -> Iterator[Near]:
     """The device where it was, or should be by now, then where a prediction has it."""
     here = frame, images, fields, config.detection.polarity, config.radius
     if config.curve.tracking and prior.previous is not None:
@@ -151,7 +161,8 @@ def _in_time(result: Reconstruction, clock: _Stopwatch) -> Reconstruction:
     """The same, or out of time where the clock cut the search short and it might have gone otherwise."""
     if not clock.cut_short or result.outcome not in OPEN:
         return result
-    found = f'the likeliest curve by then: {result.detail}' if result.outcome is Outcome.LOW_CONFIDENCE else 'no curve was found by then'
+    found = (f'the likeliest curve by then: {result.detail}'
+             if result.outcome is Outcome.LOW_CONFIDENCE else 'no curve was found by then')
     return replace(result, outcome=Outcome.OUT_OF_TIME, detail=found)
 
 
@@ -160,12 +171,14 @@ def _nothing(lines: Sequence[np.ndarray | None], config: Config, clock: _Stopwat
     seen = tuple(None if px is None else Centerline(px) for px in lines)
     for px, outcome in zip(lines, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if px is None:
-            return Reconstruction(outcome, f'no line of at least {config.detection.min_length_px:g} px stands out', centerlines=seen, stage_seconds=clock.laps)
-    return Reconstruction(Outcome.NO_CORRESPONDENCE, 'no line of plane a is one of plane b', centerlines=seen, stage_seconds=clock.laps)
+            return Reconstruction(outcome, f'no line of at least {config.detection.min_length_px:g} px stands out',
+                                  centerlines=seen, stage_seconds=clock.laps)
+    return Reconstruction(Outcome.NO_CORRESPONDENCE, 'no line of plane a is one of plane b', centerlines=seen,
+                          stage_seconds=clock.laps)
 
 
-def _by_paper(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None,
-              clock: _Stopwatch) -> Reconstruction:
+def _by_paper(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior,
+              guess: Guess | None, clock: _Stopwatch) -> Reconstruction:
     """method:=paper: segment each image, correspond, triangulate, and believe eq. 3."""
     images = [dark_device(image, config.detection.polarity) for image in images]
     widths = paper.half_width_px(frame.views, config)
@@ -174,18 +187,20 @@ def _by_paper(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.nd
     clock.lap('segment')
     for line, outcome in zip(seen, (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)):
         if line is None:
-            return Reconstruction(outcome, f'no curve of at least {config.detection.min_length_px:g} px', centerlines=seen, stage_seconds=clock.laps)
+            return Reconstruction(outcome, f'no curve of at least {config.detection.min_length_px:g} px',
+                                  centerlines=seen, stage_seconds=clock.laps)
 
     curves = paper.reconstruct_curves(frame.views, tuple(line.points_px for line in seen), config.detection.spacing_px)
     clock.lap('triangulate')
     if min(map(len, curves)) < 3:
-        return Reconstruction(Outcome.NO_CORRESPONDENCE, f'{len(curves[0])} and {len(curves[1])} corresponding points', centerlines=seen, stage_seconds=clock.laps)
+        return Reconstruction(Outcome.NO_CORRESPONDENCE, f'{len(curves[0])} and {len(curves[1])} corresponding points',
+                              centerlines=seen, stage_seconds=clock.laps)
 
     best = max(curves, key=lambda c: arc_length(c)[-1])
     metres_per_px = 1 / float(np.mean([pixels_per_metre(v.P, best) for v in frame.views]))
     sheet = sheet_of(images, fields, frame.views, 'dark')
-    forward, guessed = tip_of(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config, _known_order(best, prior, guess),
-                              _alike(best, sheet, config))
+    forward, guessed = tip_of(best[[0, -1]], _at_border(best[[0, -1]], frame.views, seen), frame.views, fields, config,
+                              _known_order(best, prior, guess), _alike(best, sheet, config))
     points, s = resample(best if forward else best[::-1], config.curve.backbone_spacing)
     residuals = residuals_px(points, frame.views, seen)
     clock.lap('curve')
@@ -196,19 +211,23 @@ def _by_paper(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.nd
     confidence = _confidence_of(points, sheet, config)
     if doubt:
         return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence)
-    shape = Shape(points, s, np.full((len(points), 3, 3), np.nan), residuals)   # the published method knows no covariance
-    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps, confidence=confidence)
+    # the published method knows no covariance
+    shape = Shape(points, s, np.full((len(points), 3, 3), np.nan), residuals)
+    return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps,
+                          confidence=confidence)
 
 
 def _confidence_of(points: np.ndarray, sheet: Sheet, config: Config) -> float:
-    """The probability that a backbone (N, 3) of dark devices is right, which a fit did not make: that of the fit which begins there, if they are one curve."""
+    """The probability that a backbone (N, 3) of dark devices is right, which a fit did not make: that of the fit which
+    begins there, if they are one curve."""
     f = fit(sheet, points, config.radius, 1)
     if f is None:
         return 0.0
     model, ends = judge.load(), f.curve(2)
     last = bool(np.linalg.norm(ends[1] - points[-1]) < np.linalg.norm(ends[0] - points[-1]))
     px = f.s[1] - f.s[0]
-    if distance_to(points, f.curve(400)).mean() > max(MEAN, MEAN_PX * px) or np.linalg.norm(ends[int(last)] - points[-1]) > max(TIP, TIP_PX * px):
+    if (distance_to(points, f.curve(400)).mean() > max(MEAN, MEAN_PX * px)
+            or np.linalg.norm(ends[int(last)] - points[-1]) > max(TIP, TIP_PX * px)):
         return 0.0
     return model.confidence(judge.probability(float(model.log_odds(features(f, sheet, config.radius, last)))))
 
@@ -216,17 +235,21 @@ def _confidence_of(points: np.ndarray, sheet: Sheet, config: Config) -> float:
 def _doubt(shape: Shape, config: Config, frame: Frame) -> tuple[Outcome, str] | None:
     """What a user has set a bound to, if the backbone is beyond it."""
     metres_per_px = 1 / float(np.mean([pixels_per_metre(v.P, shape.points) for v in frame.views]))
-    return (check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px)) or check_length(shape.length, config)
+    return (check_curvature([shape.points[::4]], curvature_limit(config, metres_per_px))
+            or check_length(shape.length, config)
             or check_reprojection(shape.residuals_px, config) or check_tip(shape.covariance[-1], config))
 
 
-def _tip(frame: Frame, fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None, f: Fit, alike: Callable[[], Likeness]) -> tuple[bool, bool]:
+def _tip(frame: Frame, fields: Sequence[np.ndarray], config: Config, prior: Prior, guess: Guess | None, f: Fit,
+         alike: Callable[[], Likeness]) -> tuple[bool, bool]:
     """Whether the last end of a fit is the tip, and whether that is a guess."""
-    return tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config, _known_order(f.curve(100), prior, guess), alike)
+    return tip_of(f.curve(2), tuple(f.open_end), frame.views, fields, config,
+                  _known_order(f.curve(100), prior, guess), alike)
 
 
 def _alike(points: np.ndarray, sheet: Sheet, config: Config) -> Callable[[], Likeness]:
-    """What the device's description says of the (N, 3) points of a curve, worked out once it is asked for; silhouettes tell nothing, they are equally dark all along."""
+    """What the device's description says of the (N, 3) points of a curve, worked out once it is asked for; silhouettes
+    tell nothing, they are equally dark all along."""
     if config.described is None or config.detection.image_kind == 'silhouette':
         return lambda: ALIKE
     return cache(partial(likeness, config.described, points, sheet, config.radius))
@@ -234,7 +257,8 @@ def _alike(points: np.ndarray, sheet: Sheet, config: Config) -> Callable[[], Lik
 
 def residuals_px(points: np.ndarray, views: Sequence[View], centerlines: Sequence[Centerline]) -> np.ndarray:
     """(N, 2) distance in px of the reprojected (N, 3) points to the centreline seen in each plane."""
-    return np.stack([distance_to(project(v.P, points), undistort(v, line.points_px)) for v, line in zip(views, centerlines)], axis=1)
+    return np.stack([distance_to(project(v.P, points), undistort(v, line.points_px))
+                     for v, line in zip(views, centerlines)], axis=1)
 
 
 def _centerline(points_px: np.ndarray, field: np.ndarray, half_width_px: float) -> Centerline | None:
@@ -254,7 +278,8 @@ def _at_border(ends: np.ndarray, views: Sequence[View], seen: Sequence[Centerlin
 
 
 def _known_order(points: np.ndarray, prior: Prior, guess: Guess | None) -> np.ndarray | None:
-    """(N, 3) a curve known to run from base to tip, m: the previous result, else the prediction if the (N, 3) points found bear it out."""
+    """(N, 3) a curve known to run from base to tip, m: the previous result, else the prediction if the (N, 3) points
+    found bear it out."""
     if prior.previous is not None:
         return prior.previous.points
     return guess.points if guess is not None and borne_out(points, guess) else None

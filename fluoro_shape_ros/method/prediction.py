@@ -1,4 +1,5 @@
-"""A kinematic model's guess of the shape: which one counts, whether it can be one at all, and whether the images bear it out."""
+"""A kinematic model's guess of the shape: which one counts, whether it can be one at all, and whether the images bear
+it out."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from .fit.fit import Fit
 STEP = 1e-3             # m, between the points that are looked at
 FLOOR = 1e-3            # m, standard deviation at the base: a robot's base is known best
 FAR = 3.0               # standard deviations: what is farther off is another curve
-LENGTH_SHARE = 0.15     # by which the found length may differ from the predicted one, beside the tip's standard deviation
+LENGTH_SHARE = 0.15     # by which the found length may differ from the predicted one,
+                        # beside the tip's standard deviation
 SHORTEST, LONGEST = 0.005, 2.0      # m, of a prediction
 INDEPENDENT = 5         # points of a prediction whose errors have little to do with one another
 
@@ -50,7 +52,8 @@ def staleness(prediction_ns: int, stamp_ns: int, max_age: float) -> str:
 
 
 def look(prior: Prior, views: Sequence[View], sigma_tip: float) -> tuple[Guess | None, str]:
-    """The guess that a prior holds, or None and why it can't be one (empty: there is none). sigma_tip: m, its standard deviation at the tip."""
+    """The guess that a prior holds, or None and why it can't be one (empty: there is none). sigma_tip: m, its standard
+    deviation at the tip."""
     points = prior.predicted
     if points is None or prior.prediction_fault:
         return None, prior.prediction_fault
@@ -95,15 +98,18 @@ def doubt(points: np.ndarray, g: Guess) -> str:
     distance = np.append(distance, np.linalg.norm(points[-1] - g.points[-1]))
     worst = int((distance / np.append(g.sigma[k], g.sigma[-1])).argmax())
     if distance[worst] > FAR * np.append(g.sigma[k], g.sigma[-1])[worst]:
-        return f'the images show the {"tip" if worst == len(points) else "device"} {1000 * distance[worst]:.1f} mm from there'
+        return (f'the images show the {"tip" if worst == len(points) else "device"} {1000 * distance[worst]:.1f} '
+                'mm from there')
     return ''
 
 
 def informed(f: Fit, g: Guess) -> Fit:
-    """The fit with what a guess that is borne out adds: a weak prior, so that it counts only where the images tell little.
+    """The fit with what a guess that is borne out adds: a weak prior, so that it counts only where the images tell
+    little.
 
-    The product of two Gaussians (Kalman's update) on the control points: across the curve at INDEPENDENT places along it, since a model's errors are the
-    same over long stretches, the guess's nearest points are observations with its standard deviations.
+    The product of two Gaussians (Kalman's update) on the control points: across the curve at INDEPENDENT places along
+    it, since a model's errors are the same over long stretches, the guess's nearest points are observations with its
+    standard deviations.
     """
     s = np.linspace(f.start, f.stop, INDEPENDENT)
     points, tangents = f.spline.lines(s)

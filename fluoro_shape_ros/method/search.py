@@ -1,4 +1,5 @@
-"""The search of whole images: hypotheses, best first, each brought to rest and judged, until one is beyond doubt or none is left."""
+"""The search of whole images: hypotheses, best first, each brought to rest and judged, until one is beyond doubt or
+none is left."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ SEEN = 0.6              # ... which must show this share of the line
 HOPELESS = -10.0        # log odds below which a fit that has not come to rest is left there ...
 PROMISING = -12.0       # ... and up to which nothing is worth a closer look ...
 CLOSER = 8              # ... at so many more hypotheses
-AS_PROPOSED = 2         # hypotheses that are fitted in the order in which they were proposed; the others in that of what is seen of them at first sight ...
+AS_PROPOSED = 2         # hypotheses that are fitted in the order in which they were proposed; the others in that of
+                        # what is seen of them at first sight ...
 FITTED = 8              # ... as long as there are fewer than so many
 
 
@@ -58,9 +60,11 @@ class Search:
     measured: what is made of a fit before it is judged.
     """
 
-    def __init__(self, sheet: Sheet, radius: float, min_length_px: float, judge: Callable[[Fit], tuple[np.ndarray, float, bool]],
+    def __init__(self, sheet: Sheet, radius: float, min_length_px: float,
+                 judge: Callable[[Fit], tuple[np.ndarray, float, bool]],
                  settles: Callable[[float], bool], guess: Guess | None = None, leads: Sequence[Fit] = (),
-                 first_sight: Callable[[np.ndarray], float] | None = None, measured: Callable[[Fit], Fit] = lambda f: f):
+                 first_sight: Callable[[np.ndarray], float] | None = None,
+                 measured: Callable[[Fit], Fit] = lambda f: f):
         self.tried: list[Attempt] = []
         self.lines: tuple = (None, None)        # (N, 2) image pixels of the line of each plane that stands out most
         self.finished = False
@@ -69,7 +73,8 @@ class Search:
         self._steps = self._all_steps(leads)
 
     def go_on(self, late: Callable[[], bool] = lambda: False) -> None:
-        """To the end, or until time is up, which is asked before each step that takes long, and only where there is one left."""
+        """To the end, or until time is up, which is asked before each step that takes long, and only where there is one
+        left."""
         while not self.finished:
             self.finished = next(self._steps, True)
             if not self.finished and late():
@@ -99,13 +104,15 @@ class Search:
             if not faint:
                 self.lines = tuple(lines[0].points_px if lines else None for lines in found)
             hypotheses = by_lines(sheet.views, found)
-            yield from self._try(hypotheses if self._first_sight is None else _most_promising(hypotheses, self._first_sight))
+            yield from self._try(hypotheses if self._first_sight is None
+                                 else _most_promising(hypotheses, self._first_sight))
         if not self._settled() and (self._guess is not None or any(t.log_odds > PROMISING for t in self.tried)):
             yield False
             yield from self._try(_at_most(CLOSER, _again(sheet, radius, found, self.tried, self._guess)))
 
     def _try(self, hypotheses: Iterator[Hypothesis | None]) -> Iterator[bool]:
-        """Fit each; once one is beyond doubt, only the same lines read the other way round, and these however late it is."""
+        """Fit each; once one is beyond doubt, only the same lines read the other way round,
+        and these however late it is."""
         last = None
         for h in hypotheses:
             if h is None:
@@ -128,7 +135,8 @@ class Search:
 
     def _may_be(self, f: Fit, h: Hypothesis) -> bool:
         """Whether a fit is long enough, and, where no line but a guess led to it, bears that out."""
-        return _long_enough(f, self._min_length_px) and (any(h.lines) or self._guess is None or borne_out(f.curve(100), self._guess))
+        return (_long_enough(f, self._min_length_px)
+                and (any(h.lines) or self._guess is None or borne_out(f.curve(100), self._guess)))
 
 
 def _at_most(count: int, hypotheses: Iterator[Hypothesis | None]) -> Iterator[Hypothesis | None]:
@@ -140,18 +148,23 @@ def _at_most(count: int, hypotheses: Iterator[Hypothesis | None]) -> Iterator[Hy
             return
 
 
-def _most_promising(hypotheses: Iterator[Hypothesis], first_sight: Callable[[np.ndarray], float]) -> Iterator[Hypothesis]:
-    """FITTED of them: the first as they come, the others by what is seen of them before any fit; those of the same two lines together."""
+def _most_promising(hypotheses: Iterator[Hypothesis],
+                    first_sight: Callable[[np.ndarray], float]) -> Iterator[Hypothesis]:
+    """FITTED of them: the first as they come, the others by what is seen of them before any fit; those of the same two
+    lines together."""
     yield from islice(hypotheses, AS_PROPOSED)
     others = list(hypotheses)
     odds = [first_sight(h.curve) for h in others]
     together = [max(o for o, other in zip(odds, others) if other.lines == h.lines) for h in others]
-    yield from islice((others[k] for k in sorted(range(len(others)), key=lambda k: (-together[k], -odds[k]))), FITTED - AS_PROPOSED)
+    yield from islice((others[k] for k in sorted(range(len(others)), key=lambda k: (-together[k], -odds[k]))),
+                      FITTED - AS_PROPOSED)
 
 
-def _again(sheet: Sheet, radius: float, found: tuple[list[Candidate], list[Candidate]], tried: list[Attempt], guess: Guess | None) -> Iterator[Hypothesis | None]:
-    """Where else it may be, when no pair of lines settled it: where a guess leads; the likeliest fits without the lines beside them, and beside these; where
-    the other plane shows what one plane's line alone says; and the likeliest again with a search around them. None before what takes long."""
+def _again(sheet: Sheet, radius: float, found: tuple[list[Candidate], list[Candidate]], tried: list[Attempt],
+           guess: Guess | None) -> Iterator[Hypothesis | None]:
+    """Where else it may be, when no pair of lines settled it: where a guess leads; the likeliest fits without the lines
+    beside them, and beside these; where the other plane shows what one plane's line alone says; and the likeliest again
+    with a search around them. None before what takes long."""
     led = None if guess is None else follow(sheet, guess, radius, clear=False)
     if led is not None:
         yield Hypothesis(led)
@@ -168,18 +181,21 @@ def _again(sheet: Sheet, radius: float, found: tuple[list[Candidate], list[Candi
             yield None
             path = sweep(undistort(view, c.points_px), (view, views[1 - k]), (dark[k], dark[1 - k]))
             if path is not None and path.share > SEEN:
-                paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points, (None, c) if k else (c, None)))
+                paths.append((np.sqrt(path.score) * path.share**2 * c.score, path.points,
+                              (None, c) if k else (c, None)))
     yield from (Hypothesis(points, lines, clearing=True) for _, points, lines in sorted(paths, key=lambda p: -p[0]))
     yield from (Hypothesis(t.fit.curve(200), t.lines, coarse=COARSE, clearing=True) for t in likeliest)
 
 
 def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options: Any) -> Fit | None:
     """A fit from a path that may be some px off, once more where it has not come to rest. options: of fit."""
-    return fitted if fitted is None or fitted.moved_px <= RESTLESS_PX else fit(sheet, fitted.curve(200), radius, 0, **options)
+    return (fitted if fitted is None or fitted.moved_px <= RESTLESS_PX
+            else fit(sheet, fitted.curve(200), radius, 0, **options))
 
 
 def choose(tried: Sequence[Attempt]) -> tuple[Attempt, float]:
-    """The likeliest attempt, and the probability that it is right: of curves that exclude one another at most one can be, by Bayes' rule p = o / (1 + sum of odds)."""
+    """The likeliest attempt, and the probability that it is right: of curves that exclude one another at most one can
+    be, by Bayes' rule p = o / (1 + sum of odds)."""
     ranked = sorted(tried, key=lambda t: -t.log_odds)
     best, rivals = ranked[0], list[Attempt]()
     for t in ranked[1:]:
@@ -190,12 +206,14 @@ def choose(tried: Sequence[Attempt]) -> tuple[Attempt, float]:
 
 
 def exclusive(a: Attempt, b: Attempt) -> bool:
-    """Whether at most one of two can be right: their tips, or one's course from the other's, lie apart by more than twice what may be wrong."""
+    """Whether at most one of two can be right: their tips, or one's course from the other's, lie apart by more than
+    twice what may be wrong."""
     px = a.fit.s[1] - a.fit.s[0]
     if np.linalg.norm(a.tip - b.tip) > 2 * max(TIP, TIP_PX * px):
         return True
     one, other = a.fit.curve(100), b.fit.curve(100)
-    return bool(min(cKDTree(one).query(other)[0].mean(), cKDTree(other).query(one)[0].mean()) > 2 * max(MEAN, MEAN_PX * px))
+    return bool(min(cKDTree(one).query(other)[0].mean(), cKDTree(other).query(one)[0].mean())
+                > 2 * max(MEAN, MEAN_PX * px))
 
 
 def projected(f: Fit, view: View) -> np.ndarray:

@@ -13,13 +13,15 @@ from ..imaging.field import border_distance
 from .known_device import ALIKE, SURE, Likeness
 
 
-def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Callable[[], np.ndarray], base_position: Sequence[float] = (),
+def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Callable[[], np.ndarray],
+                base_position: Sequence[float] = (),
                 previous: np.ndarray | None = None, alike: Callable[[], Likeness] = lambda: ALIKE) -> tuple[bool, bool]:
     """Whether the last of a device's two ends is the tip, and whether that is a guess.
 
-    ends: (2, 3) first and last point, m. at_border: whether each lies at the field's border in a plane. border_px: called only when all else
-    fails, gives the (2, 2) distance of each end (row) from the nearest border in each plane (column). base_position: where the device enters, m, or
-    empty. previous: (N, 3) the last result, base to tip, m. alike: called only when these tell nothing, what the device's description says.
+    ends: (2, 3) first and last point, m. at_border: whether each lies at the field's border in a plane.
+    border_px: called only when all else fails, gives the (2, 2) distance of each end (row) from the nearest border in
+    each plane (column). base_position: where the device enters, m, or empty. previous: (N, 3) the last result, base to
+    tip, m. alike: called only when these tell nothing, what the device's description says.
     """
     first, last = at_border
     if first != last:
@@ -38,7 +40,8 @@ def tip_is_last(ends: np.ndarray, at_border: tuple[bool, bool], border_px: Calla
     return bool(nearest[1] >= nearest[0]), True
 
 
-def tip_of(ends: np.ndarray, at_border: tuple[bool, bool], views: Sequence[View], fields: Sequence[np.ndarray], config: Config, known: np.ndarray | None,
+def tip_of(ends: np.ndarray, at_border: tuple[bool, bool], views: Sequence[View], fields: Sequence[np.ndarray],
+           config: Config, known: np.ndarray | None,
            alike: Callable[[], Likeness] = lambda: ALIKE) -> tuple[bool, bool]:
     """The contract's rule on a backbone's two ends (2, 3): whether the last is the tip, and whether that is a guess."""
     def border_px() -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Where the device was, or where a prediction has it: looked for in a region around that, without a search of the whole images."""
+"""Where the device was, or where a prediction has it: looked for in a region around that, without a search of the whole
+images."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ class Near:
     alone: bool         # whether nothing but its probability asks for a search of the whole images
 
 
-def tracked(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], polarity: str, radius: float, prior: Prior) -> Near | None:
+def tracked(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], polarity: str, radius: float,
+            prior: Prior) -> Near | None:
     """The device where it would be at constant velocity, else near where it was; None where it is at neither place."""
     expected = going_on(prior, frame.stamp_ns)
     previous = None if prior.previous is None else prior.previous.points
@@ -47,7 +49,8 @@ def tracked(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndar
     return None
 
 
-def predicted(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], polarity: str, radius: float, guess: Guess) -> Near | None:
+def predicted(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], polarity: str, radius: float,
+              guess: Guess) -> Near | None:
     """The device near a guess; None where the images show none there that bears it out."""
     regions = [region_around(v, guess.points, reach_px(guess, v)) for v in frame.views]
     sheet = sheet_of(images, fields, frame.views, polarity, regions)
@@ -64,7 +67,8 @@ def _cut_off(fitted: Fit, sheet: Sheet, regions: Sequence[tuple[slice, slice]], 
     """Whether it ends at the edge of a region that is not the image's: there it may go on."""
     for (rows, columns), view, part in zip(regions, views, sheet.views):
         ends, last = projected(fitted, part)[[0, -1]], np.array([columns.stop - columns.start, rows.stop - rows.start])
-        low, high = np.array([columns.start, rows.start]) > 0, np.array([columns.stop, rows.stop]) < [view.width, view.height]
+        low, high = (np.array([columns.start, rows.start]) > 0,
+                     np.array([columns.stop, rows.stop]) < [view.width, view.height])
         if ((ends < EDGE_PX) & low | (ends > last - EDGE_PX) & high).any():
             return True
     return False

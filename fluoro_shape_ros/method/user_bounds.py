@@ -12,7 +12,8 @@ from ..geometry.curve import curvature, middle
 
 
 def check_tip(covariance: np.ndarray, config: Config) -> tuple[Outcome, str] | None:
-    """Standard deviation of the tip in its worst direction, from its (3, 3) covariance in m^2: None, or the rejection."""
+    """Standard deviation of the tip in its worst direction, from its (3, 3) covariance in m^2: None, or the
+    rejection."""
     limit = config.plausibility.max_tip_sigma
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])) if np.isfinite(covariance).all() else float('inf')
     if limit and not sigma <= limit:
@@ -37,13 +38,16 @@ def check_length(length: float, config: Config) -> tuple[Outcome, str] | None:
     """Length in m against `expected_length`: None, or the rejection."""
     bounds = config.plausibility.expected_length
     if bounds and not bounds[0] <= length <= bounds[1]:
-        return Outcome.LENGTH, f'length {length * 1000:.1f} mm is outside [{bounds[0] * 1000:.1f}, {bounds[1] * 1000:.1f}] mm'
+        return (Outcome.LENGTH, f'length {length * 1000:.1f} mm is outside '
+                                f'[{bounds[0] * 1000:.1f}, {bounds[1] * 1000:.1f}] mm')
     return None
 
 
 def check_reprojection(residuals_px: np.ndarray, config: Config) -> tuple[Outcome, str] | None:
     """Median of the (N, 2) residuals of each plane: None, or the rejection."""
-    worst = max((float(middle(r[np.isfinite(r)])) for r in residuals_px.T if np.isfinite(r).any()), default=float('nan'))
+    worst = max((float(middle(r[np.isfinite(r)])) for r in residuals_px.T if np.isfinite(r).any()),
+                default=float('nan'))
     if worst > config.plausibility.max_reprojection_px:
-        return Outcome.REPROJECTION, f'median reprojection residual {worst:.1f} px exceeds {config.plausibility.max_reprojection_px:g} px'
+        return (Outcome.REPROJECTION, f'median reprojection residual {worst:.1f} px exceeds '
+                                      f'{config.plausibility.max_reprojection_px:g} px')
     return None

@@ -1,9 +1,11 @@
-"""Whether the calibrations of both planes belong together, told from where each plane by itself sees the device's ends, bands and bends, over a run.
+"""Whether the calibrations of both planes belong together, told from where each plane by itself sees the device's ends,
+bands and bends, over a run.
 
-A place that both planes see must lie on its epipolar line in plane B. By how many px it lies beside it is a linear function of what is wrong: a plane is
-shifted, turned about its image's centre, or as a whole too large. What else moves it is known by size: noise, and a bias of each kind of landmark that
-stays the same over a run. So the odds that something is wrong are a ratio of two Gaussian integrals in closed form (a Bayes factor). By Ville's
-inequality it exceeds 1 / FALSE_ALARM in at most that share of the runs whose calibrations are right, however often it is looked at.
+A place that both planes see must lie on its epipolar line in plane B. By how many px it lies beside it is a linear
+function of what is wrong: a plane is shifted, turned about its image's centre, or as a whole too large. What else moves
+it is known by size: noise, and a bias of each kind of landmark that stays the same over a run. So the odds that
+something is wrong are a ratio of two Gaussian integrals in closed form (a Bayes factor). By Ville's inequality it
+exceeds 1 / FALSE_ALARM in at most that share of the runs whose calibrations are right, however often it is looked at.
 """
 
 from __future__ import annotations
@@ -17,14 +19,16 @@ import numpy as np
 from ..data import Landmarks, Reconstruction, View
 from ..geometry.cameras import epipolar_lines, fundamental
 
-FALSE_ALARM = 1e-2      # share of the runs with right calibrations in which it cries, at most, by the model (drawn from that: 1 of 1800)
+FALSE_ALARM = 1e-2      # share of the runs with right calibrations in which it cries, at most, by the model (drawn from
+                        # that: 1 of 1800)
 RATHER = 0.5            # confidence of a curve, refused or not, from which on its landmarks count
 BLOCK = 5               # landmarks of a kind, successive ones, of which the middle one counts: some are wrong ...
 TOGETHER = 2            # ... and as they look alike, it is worth no more than so many of them
 MEMORY = 200            # observations after which what was seen counts a third as much
 PLACE_PX = 0.1          # what a landmark is worth at best
 KINDS = 'tip', 'base', 'steps', 'bend'
-# What may be wrong, and its typical size where it is: px, rad, rad, a share; where it is not it is as good as calibrations are
+# What may be wrong, and its typical size where it is: px, rad, rad, a share; where it is not it is as good as
+# calibrations are
 WRONG = {'shifted': (3.0, 0.1), 'turned a': (0.03, 3.5e-4), 'turned b': (0.03, 3.5e-4), 'scaled': (0.02, 4e-4)}
 BIAS = 0.5, 0.5, 0.5, 0.15      # of each kind, in its own standard deviations (measured: 0.3 to 0.5); of a bend px
 EVEN = np.log(20)       # log odds from which on one explanation is better than another
@@ -36,7 +40,8 @@ class Finding:
 
     pairs: int = 0
     noticed: bool = False
-    apart_px: float | None = None   # by how much the planes' landmarks lie beside their epipolar lines, typically, biases taken off; None: not known yet
+    apart_px: float | None = None   # by how much the planes' landmarks lie beside their epipolar lines, typically,
+                                    # biases taken off; None: not known yet
     sigma_px: float | None = None
     looks_like: str = ''            # what explains it best; empty where several do
 
@@ -47,11 +52,13 @@ class Finding:
         if not self.noticed:
             return f'nothing noticed: the planes agree within {self.apart_px + 2 * self.sigma_px:.1f} px {over}'
         like = f', {self.looks_like}' if self.looks_like else ''
-        return f'the planes disagree by {self.apart_px:.1f} px +- {max(self.sigma_px, 0.05):.1f} {over}{like}: check the calibration'
+        return (f'the planes disagree by {self.apart_px:.1f} px +- {max(self.sigma_px, 0.05):.1f} {over}{like}: '
+                'check the calibration')
 
 
 class CalibrationWatch:
-    """Takes the results of a run, one after another; `finding` is what they say. May be told and asked from any thread."""
+    """Takes the results of a run, one after another; `finding` is what they say. May be told and asked from any
+    thread."""
 
     finding: Finding
     _waiting: dict[str, list]                   # by kind, landmarks that are not yet a BLOCK, as given and exchanged
@@ -67,7 +74,8 @@ class CalibrationWatch:
             self._begin()
 
     def take(self, result: Reconstruction, views: tuple[View, View], cameras: Hashable) -> None:
-        """The answer to one more pair, and its views. Where the `cameras` are others than those before it begins anew."""
+        """The answer to one more pair, and its views. Where the `cameras` are others than those before it begins
+        anew."""
         with self._lock:
             if cameras != self._cameras:
                 self._cameras = cameras
@@ -105,7 +113,8 @@ class Evidence:
         self.weight = old * self.weight + 1 / sigma**2
 
     def log_likelihood(self, size: np.ndarray) -> float:
-        """Of all observations, if the unknowns have standard deviations `size` (n,), integrated over them; up to a constant."""
+        """Of all observations, if the unknowns have standard deviations `size` (n,), integrated over them; up to a
+        constant."""
         return 0.5 * float(self.pull @ self.likeliest(size) - np.linalg.slogdet(self._given(size))[1] - self.surprise)
 
     def likeliest(self, size: np.ndarray) -> np.ndarray:
@@ -113,7 +122,8 @@ class Evidence:
         return size * np.linalg.solve(self._given(size), size * self.pull)
 
     def apart(self, size: np.ndarray) -> tuple[float, float]:
-        """px that landmarks lie beside their lines, root mean square of what is wrong alone, and its standard deviation."""
+        """px that landmarks lie beside their lines, root mean square of what is wrong alone, and its standard
+        deviation."""
         covariance = size[:, None] * np.linalg.inv(self._given(size)) * size
         wrong = slice(len(WRONG))
         mean, part = (covariance @ self.pull)[wrong], self.information[wrong, wrong] / self.weight
@@ -132,41 +142,49 @@ def judged(before: Finding, as_given: Evidence, exchanged: Evidence) -> Finding:
     odds = {what: as_given.log_likelihood(_size(what)) - nothing for what in (*WRONG, '')}
     odds['exchanged'] = exchanged.log_likelihood(_size()) - nothing
     total = float(np.logaddexp.reduce(list(odds.values())) - np.log(len(odds)))
-    noticed = bool(total > -np.log(FALSE_ALARM)) or before.noticed and total > 0        # what was noticed is not taken back at once
+    # what was noticed is not taken back at once
+    noticed = bool(total > -np.log(FALSE_ALARM)) or before.noticed and total > 0
     everything, (best, second) = odds.pop(''), sorted(odds, key=odds.get)[:-3:-1]
     best = '' if everything - odds[best] > EVEN else best if odds[best] - odds[second] > EVEN else None
-    return Finding(before.pairs, noticed, *as_given.apart(_size(*WRONG)), _in_words(best, as_given) if noticed and best is not None else '')
+    return Finding(before.pairs, noticed, *as_given.apart(_size(*WRONG)),
+                   _in_words(best, as_given) if noticed and best is not None else '')
 
 
 def _in_words(what: str, evidence: Evidence) -> str:
     """What explains the evidence: one of WRONG, '' (all of it) or exchanged planes."""
     if what not in WRONG:
-        return 'and would agree if the calibrations were exchanged' if what else 'by more than a shift, a turn or a scale alone'
+        return ('and would agree if the calibrations were exchanged'
+                if what else 'by more than a shift, a turn or a scale alone')
     by = abs(evidence.likeliest(_size(what))[list(WRONG).index(what)])
-    return {'shifted': f'as if one were shifted by {by:.1f} px', 'scaled': f'as if one were {100 * by:.1f} % too large'}.get(
-        what, f'as if plane {what[-1].upper()} were turned by {np.rad2deg(by):.1f} degrees')
+    return {'shifted': f'as if one were shifted by {by:.1f} px',
+            'scaled': f'as if one were {100 * by:.1f} % too large'}.get(
+                what, f'as if plane {what[-1].upper()} were turned by {np.rad2deg(by):.1f} degrees')
 
 
 def _size(*wrong: str) -> np.ndarray:
     """(n,) standard deviations of the unknowns where so much is wrong; '': all of it."""
-    return np.array([off if what in wrong or '' in wrong else right for what, (off, right) in WRONG.items()] + list(BIAS))
+    return np.array([off if what in wrong or '' in wrong else right for what, (off, right) in WRONG.items()]
+                    + list(BIAS))
 
 
 def observed(landmarks: Landmarks, views: tuple[View, View]) -> np.ndarray:
-    """(N, 2 + n): for each landmark the px by which it lies beside its epipolar line in plane B, their standard deviation, and how they depend on each unknown."""
+    """(N, 2 + n): for each landmark the px by which it lies beside its epipolar line in plane B, their standard
+    deviation, and how they depend on each unknown."""
     Pa, Pb = (v.P for v in views)
     F = fundamental(Pa, Pb)
     lines, back = epipolar_lines(F, landmarks.a_px), epipolar_lines(F.T, landmarks.b_px)
     normal_b, normal_a = lines[:, :2], back[:, :2]
     apart = (normal_b * landmarks.b_px).sum(axis=1) + lines[:, 2]
     finer = _steepness(F.T, landmarks.b_px) / _steepness(F, landmarks.a_px)     # px in plane B for one in plane A
-    (ua, va), (ub, vb) = ((px - [(v.width - 1) / 2, (v.height - 1) / 2]).T for px, v in zip((landmarks.a_px, landmarks.b_px), views))
+    (ua, va), (ub, vb) = ((px - [(v.width - 1) / 2, (v.height - 1) / 2]).T
+                          for px, v in zip((landmarks.a_px, landmarks.b_px), views))
     turned_a = finer * (normal_a[:, 1] * ua - normal_a[:, 0] * va)
     turned_b = normal_b[:, 1] * ub - normal_b[:, 0] * vb
     scaled = normal_b[:, 0] * ub + normal_b[:, 1] * vb
     slack = (normal_b * landmarks.slack_px).sum(axis=1)
     slack = np.where(slack < 0, -1, 1) * np.hypot(slack, PLACE_PX)
-    bias = np.array([[kind == k for k in KINDS] for kind in landmarks.kinds], float) * np.where(np.array(landmarks.kinds) == 'bend', 1.0, slack)[:, None]
+    bias = (np.array([[kind == k for k in KINDS] for kind in landmarks.kinds], float)
+            * np.where(np.array(landmarks.kinds) == 'bend', 1.0, slack)[:, None])
     return np.column_stack([apart, np.abs(slack), np.ones(len(apart)), turned_a, turned_b, scaled, bias])
 
 

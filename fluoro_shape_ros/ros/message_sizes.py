@@ -1,4 +1,5 @@
-"""Whoever publishes must not decide how much memory and time the node takes: what is too large is not kept, but named."""
+"""Whoever publishes must not decide how much memory and time the node takes: what is too large is not kept, but
+named."""
 
 from __future__ import annotations
 

@@ -19,7 +19,14 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.cameras import BadCameraInfo
-from msg_adapters.diagnostics import Tally, diagnostic_array, pairing_status, plane_status, reconstruction_status, trouble
+from msg_adapters.diagnostics import (
+    Tally,
+    diagnostic_array,
+    pairing_status,
+    plane_status,
+    reconstruction_status,
+    trouble,
+)
 from msg_adapters.messages import ros_message, stamp_ns
 from msg_adapters.shapes import BadPath, path_to_points
 
@@ -46,9 +53,11 @@ WARN_S = 30.0           # ... and another one after that
 
 
 class FluoroShapeNode(Node):
-    """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread has the newest pair reconstructed and publishes.
+    """Two image streams in, backbone and tip out. Callbacks only pair; one worker thread has the newest pair
+    reconstructed and publishes.
 
-    Raises ConfigError where a parameter given at the start can't work, and TfMissing where it asks for tf and there is none.
+    Raises ConfigError where a parameter given at the start can't work, and TfMissing where it asks for tf and there is
+    none.
     """
 
     _levels: list[int] | None
@@ -73,27 +82,31 @@ class FluoroShapeNode(Node):
 
         overridable = QoSOverridingOptions.with_default_policies()
         self._outputs = Outputs(self)
-        self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10), qos_overriding_options=overridable)
+        self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', QoSProfile(depth=10),
+                                                      qos_overriding_options=overridable)
         self._answered = self.create_guard_condition(self._report_changes)
         self._worker = Worker(self._work, self._failed, self._get_ready)
         self._inputs = None
         self._listen()
-        self.create_subscription(Path, 'predicted_backbone', surviving(self._on_prediction, self._bug), QoSProfile(depth=1),
-                                 qos_overriding_options=overridable, raw=True)
+        self.create_subscription(Path, 'predicted_backbone', surviving(self._on_prediction, self._bug),
+                                 QoSProfile(depth=1), qos_overriding_options=overridable, raw=True)
         for name, kind, callback in (('reset', Trigger, self._on_reset), ('enable', SetBool, self._on_enable),
-                                     ('capture_mask', Trigger, self._on_capture_mask), ('clear_mask', Trigger, self._on_clear_mask)):
+                                     ('capture_mask', Trigger, self._on_capture_mask),
+                                     ('clear_mask', Trigger, self._on_clear_mask)):
             self.create_service(kind, f'~/{name}', callback)
         self.add_pre_set_parameters_callback(params.as_declared)
         self.add_on_set_parameters_callback(self._on_check_parameters)
         self.add_post_set_parameters_callback(self._on_parameters)
-        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))    # also while /clock stands still
+        # also while /clock stands still
+        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         unknown = params.unknown(self)
         if unknown:
             self.get_logger().warning(unknown)
         self._introduce()
 
     def stop(self, timeout_s: float) -> bool:
-        """End the worker, which is given that long for the pair at work, if there is one; False where it can't be ended."""
+        """End the worker, which is given that long for the pair at work, if there is one; False where it can't be
+        ended."""
         if not self._worker.stop(timeout_s if self._worker.busy_s else 0.0):
             self._reconstructor.end()
         return self._worker.stop(timeout_s)
@@ -175,7 +188,8 @@ class FluoroShapeNode(Node):
             if self._doubts:
                 self.get_logger().warning('; '.join(self._doubts), throttle_duration_sec=WARN_S)
             prediction = newest(self._predictions, pair.stamps[0])
-            lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation, pair.arrived, prediction))
+            lost += self._worker.offer(Job(pair.stamps[0], pair.items, cameras, self._config, self._memory.generation,
+                                           pair.arrived, prediction))
         self._drop(lost)
 
     def _drop(self, pairs: int) -> None:
@@ -210,7 +224,8 @@ class FluoroShapeNode(Node):
         pairs = self._config.input.mask_frames
         self._memory.capture_mask(pairs)
         self._report_changes()
-        response.success, response.message = True, f'the next {pairs} pairs become the mask: keep the device out of the field'
+        response.success, response.message = (True, f'the next {pairs} pairs become the mask: '
+                                                    'keep the device out of the field')
         return response
 
     def _on_clear_mask(self, request, response):
@@ -244,7 +259,8 @@ class FluoroShapeNode(Node):
 
     def _get_ready(self, waited_for: bool) -> None:
         """In the worker's thread, before each pair and now and then while there is none."""
-        if not waited_for or self._reconstructor.here:      # else that is done while the next one is reconstructed over there
+        # else that is done while the next one is reconstructed over there
+        if not waited_for or self._reconstructor.here:
             self._finish()
         self._reconstructor.get_ready()
 
@@ -256,7 +272,8 @@ class FluoroShapeNode(Node):
             self._threads = job.config.input.threads
             cv2.setNumThreads(self._threads or -1)      # 0 would mean none for OpenCV
         adapted = adapt(job, self._view_of, self._lookup, self._tally)
-        frame, result = (None, adapted) if isinstance(adapted, Reconstruction) else (adapted, self._reconstruct(job, adapted, until))
+        frame, result = ((None, adapted) if isinstance(adapted, Reconstruction)
+                         else (adapted, self._reconstruct(job, adapted, until)))
         latency_s = time.monotonic() - job.arrived
         self._finish()
         if result is None:
@@ -289,15 +306,16 @@ class FluoroShapeNode(Node):
         self._outputs.answer(frame, result)
         if result.shape is not None and not self._has_result:
             self._has_result = True
-            self.get_logger().info(f'first result, {1e3 * (time.monotonic() - job.arrived):.0f} ms after its images: {1e3 * result.shape.length:.1f} mm long, '
-                                   f'in frame "{frame.frame_id}"')
+            self.get_logger().info(f'first result, {1e3 * (time.monotonic() - job.arrived):.0f} ms after its images: '
+                                   f'{1e3 * result.shape.length:.1f} mm long, in frame "{frame.frame_id}"')
         return result
 
     def _failed(self, job: Job, error: Exception) -> None:
         self._bug(error, time.monotonic() - job.arrived)
 
     def _bug(self, error: Exception, latency_s: float = 0.0) -> None:
-        """An exception that nobody foresaw, in either thread or in the process that reconstructs: said once, counted always."""
+        """An exception that nobody foresaw, in either thread or in the process that reconstructs: said once, counted
+        always."""
         if not self.context.ok():   # what fails while the node goes down is no news
             return
         bug = error.bug if isinstance(error, BugThere) else Bug.of(error)
@@ -319,17 +337,22 @@ class FluoroShapeNode(Node):
     def _summaries(self) -> tuple:
         """Of the planes, of the pairing and of the reconstruction."""
         gap = self._pairer.gap_ns
-        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None, **self._inputs.known(plane)) for plane in PLANES]
-        pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop, gap_s=None if gap is None else gap / 1e9,
+        planes = [self._tally.plane(plane, has_camera=self._books[plane].newest is not None,
+                                    **self._inputs.known(plane)) for plane in PLANES]
+        pairing = self._tally.pairing(self._pairer.counts, slop_s=self._config.input.sync_slop,
+                                      gap_s=None if gap is None else gap / 1e9,
                                       lossy=any(plane.reliability == 'best_effort' for plane in planes))
         fault = self._tally.reason('prediction')
-        still = 'use_sim_time is set, but there is no /clock' if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else ''
+        still = ('use_sim_time is set, but there is no /clock'
+                 if self.get_clock().ros_time_is_active and not self.get_clock().now().nanoseconds else '')
         restarted = self._restarted if self._tally.lately('restart') else ''
         watch = self._watch.finding
-        notes = tuple(filter(None, (restarted, self._memory.note, fault and f'predicted_backbone: {fault}', still, self._namesakes, *self._doubts,
-                                    str(watch) if watch.noticed else '')))
-        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask, capturing=self._memory.capturing, notes=notes, calibration=str(watch),
-                                             overdue_s=self._overdue_s(), here=self._reconstructor.here, restarts=self._tally.count('restart'))
+        notes = tuple(filter(None, (restarted, self._memory.note, fault and f'predicted_backbone: {fault}', still,
+                                    self._namesakes, *self._doubts, str(watch) if watch.noticed else '')))
+        results = self._tally.reconstruction(enabled=self._enabled, mask=self._memory.mask,
+                                             capturing=self._memory.capturing, notes=notes, calibration=str(watch),
+                                             overdue_s=self._overdue_s(), here=self._reconstructor.here,
+                                             restarts=self._tally.count('restart'))
         return planes, pairing, results
 
     def _statuses(self) -> list:
@@ -348,7 +371,8 @@ class FluoroShapeNode(Node):
 
     def _report(self, statuses) -> None:
         self._levels = _key(statuses)
-        self._diagnostics_out.publish(diagnostic_array(statuses, self.get_clock().now().nanoseconds, self.get_fully_qualified_name(), ros_message))
+        self._diagnostics_out.publish(diagnostic_array(statuses, self.get_clock().now().nanoseconds,
+                                                       self.get_fully_qualified_name(), ros_message))
 
     def _report_changes(self) -> None:
         statuses = self._statuses()
@@ -356,7 +380,9 @@ class FluoroShapeNode(Node):
             self._report(statuses)
 
     def _on_second(self) -> None:
-        gc.collect()    # cheap after node.main's freeze; Python keeps thousands of freed tuples for later, and only this gives them back
+        # cheap after node.main's freeze; Python keeps thousands of freed tuples for later,
+        # and only this gives them back
+        gc.collect()
         self._inputs.count()
         self._hand_over()
         self._warn()
@@ -366,18 +392,23 @@ class FluoroShapeNode(Node):
         """The log's first line."""
         given, named = self._config, self.resolve_topic_name
         suffix = '/compressed' if given.input.image_transport == 'compressed' else ''
-        images, infos = (' and '.join(named(f'plane_{plane}/{topic}') + more for plane in PLANES) for topic, more in (('image_raw', suffix), ('camera_info', '')))
-        frame = f'frame "{given.input.reference_frame}"' if given.input.reference_frame else 'the frame of plane A\'s camera info'
-        self.get_logger().info(f'images on {images}, cameras on {infos} (geometry {given.input.geometry}); results on {named("backbone")} and '
+        images, infos = (' and '.join(named(f'plane_{plane}/{topic}') + more for plane in PLANES)
+                         for topic, more in (('image_raw', suffix), ('camera_info', '')))
+        frame = (f'frame "{given.input.reference_frame}"' if given.input.reference_frame
+                 else 'the frame of plane A\'s camera info')
+        self.get_logger().info(f'images on {images}, cameras on {infos} (geometry {given.input.geometry}); '
+                               f'results on {named("backbone")} and '
                                f'{named("tip")} in {frame}; method {given.curve.method}, {_radius(given)}')
         if self._reconstructor.here:
-            self.get_logger().info(f'reconstructing in a thread of the node, not in a process of its own: {self._reconstructor.here}')
+            self.get_logger().info('reconstructing in a thread of the node, not in a process of its own: '
+                                   f'{self._reconstructor.here}')
 
     def _warn(self) -> None:
         """A line in the log now and then, while no results come or another node has the same name."""
         me = self.get_name(), self.get_namespace()
         count = self.get_node_names_and_namespaces().count(me)
-        self._namesakes = f'{count} nodes are named {self.get_fully_qualified_name()}: end all but one, or give them other names' if count > 1 else ''
+        self._namesakes = (f'{count} nodes are named {self.get_fully_qualified_name()}: end all but one, '
+                           'or give them other names' if count > 1 else '')
         if self._namesakes:
             self.get_logger().warning(self._namesakes, throttle_duration_sec=WARN_S)
         if self._watch.finding.noticed:
@@ -392,7 +423,8 @@ class FluoroShapeNode(Node):
 
 def _radius(config: Config) -> str:
     """What is looked for, and who says so."""
-    return f'robot_radius {1e3 * config.radius:g} mm' + (f', that of device {config.detection.device}' if config.described else '')
+    return f'robot_radius {1e3 * config.radius:g} mm' + (f', that of device {config.detection.device}'
+                                                         if config.described else '')
 
 
 def _key(statuses) -> list:

@@ -23,13 +23,16 @@ from .worker import Job, decode
 
 
 class Outputs:
-    """The publishers of results; reliable, depth 1, and QoS overrides are allowed. Used by the worker's thread alone."""
+    """The publishers of results; reliable, depth 1, and QoS overrides are allowed. Used by the worker's thread
+    alone."""
 
     def __init__(self, node: Node):
         def publisher(kind, topic):
-            return node.create_publisher(kind, topic, QoSProfile(depth=1), qos_overriding_options=QoSOverridingOptions.with_default_policies())
+            return node.create_publisher(kind, topic, QoSProfile(depth=1),
+                                         qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self._backbone, self._tip = publisher(Path, 'backbone'), publisher(PointStamped, 'tip')
-        self._pose, self._points = publisher(PoseWithCovarianceStamped, 'tip_pose'), publisher(PointCloud2, 'backbone_points')
+        self._pose, self._points = (publisher(PoseWithCovarianceStamped, 'tip_pose'),
+                                    publisher(PointCloud2, 'backbone_points'))
         self._markers = publisher(MarkerArray, 'markers')
         self._overlays = [publisher(Image, f'plane_{plane}/overlay') for plane in PLANES]
 
@@ -40,11 +43,13 @@ class Outputs:
             self._tip.publish(shape_to_tip(result.shape, frame.stamp_ns, frame.frame_id, ros_message))
 
     def explain(self, job: Job, frame: Frame | None, result: Reconstruction) -> None:
-        """Publish what else there is to say of a pair, of a rejected one too; `frame` is None where the messages were no frame."""
+        """Publish what else there is to say of a pair, of a rejected one too; `frame` is None where the messages were
+        no frame."""
         if result.shape is not None and self._pose.get_subscription_count():
             self._pose.publish(shape_to_tip_pose(result.shape, job.stamp_ns, job.frame_id, ros_message))
         if result.shape is not None and self._points.get_subscription_count():
-            self._points.publish(shape_to_cloud(result.shape, result.confidence, job.stamp_ns, job.frame_id, ros_message))
+            self._points.publish(shape_to_cloud(result.shape, result.confidence, job.stamp_ns, job.frame_id,
+                                                ros_message))
         if self._markers.get_subscription_count():
             self._markers.publish(_markers(job, frame, result))
         for plane, out in enumerate(self._overlays):

@@ -7,7 +7,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 PLANES = ('a', 'b')
-JUMP_NS = 500_000_000   # farther back than this is no late frame: the stream has started anew (bag loop, simulator restart)
+JUMP_NS = 500_000_000   # farther back than this is no late frame: the stream has started anew (bag loop,
+                        # simulator restart)
 BUFFER = 8              # images a plane that wait for a partner
 RECENT = 64             # stamps a plane among which a duplicate is known
 LAST_NS = (2**31 - 1) * 10**9   # of builtin_interfaces/Time, whose seconds are an int32
@@ -56,12 +57,14 @@ class _Plane:
         return min(range(len(self.stamps)), key=lambda k: (abs(self.stamps[k] - stamp), -k))
 
     def can_bring(self, before: int) -> bool:
-        """Whether this plane, going on at the pace seen so far, may still send a frame stamped earlier than `before`."""
+        """Whether this plane, going on at the pace seen so far, may still send a frame stamped earlier than
+        `before`."""
         return bool(self.steps) and self.newest + min(self.steps) < before
 
 
 class Pairer:
-    """Pairs frames whose stamps differ by at most `slop_ns`, each with its nearest partner, never an older pair after a newer one."""
+    """Pairs frames whose stamps differ by at most `slop_ns`, each with its nearest partner, never an older pair after a
+    newer one."""
 
     def __init__(self, slop_ns: int):
         self.slop_ns = slop_ns
@@ -124,7 +127,8 @@ class Pairer:
         return None
 
     def _settled(self, stamp_a: int, stamp_b: int) -> bool:
-        """Whether two frames, nearest to each other of all that wait, are near enough and nothing nearer is to be expected."""
+        """Whether two frames, nearest to each other of all that wait, are near enough and nothing nearer is to be
+        expected."""
         a, b = self._planes.values()
         gap = abs(stamp_a - stamp_b)
         lagging, later = (a, stamp_b) if stamp_a < stamp_b else (b, stamp_a)

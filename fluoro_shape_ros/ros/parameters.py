@@ -13,7 +13,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSReliabilityPolic
 
 from ..config import Config, ConfigError, constraint, fields
 
-_TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE, str: Parameter.Type.STRING}
+_TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
+          str: Parameter.Type.STRING}
 _FIELDS = {f.name: f for f in fields()}
 _QOS = {'history': QoSHistoryPolicy, 'reliability': QoSReliabilityPolicy, 'durability': QoSDurabilityPolicy}
 MAX_DEPTH = 10000       # of a queue; the middleware makes room for some of it at once
@@ -27,7 +28,8 @@ def declare(node: Node) -> Config:
     _check_qos(node)
     # Statically typed declarations refuse `robot_radius:=1` and can't express an empty list, so: take what is
     # there, check and convert it, and only then fix type and range.
-    given = {name: node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value for name in _FIELDS}
+    given = {name: node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value
+             for name in _FIELDS}
     config = Config.from_values(**{name: _plain(value) for name, value in given.items() if value is not None})
     for name, value in config.values().items():
         node.set_parameters([_parameter(_FIELDS[name], value)])
@@ -36,7 +38,8 @@ def declare(node: Node) -> Config:
 
 
 def unknown(node: Node) -> str:
-    """The values given at the start to what is no parameter of `node`, each with the parameter that may be meant, in words; empty where there are none."""
+    """The values given at the start to what is no parameter of `node`, each with the parameter that may be meant, in
+    words; empty where there are none."""
     known = list(node.get_parameters_by_prefix(''))
     words = []
     for name in _overrides(node):
@@ -53,7 +56,8 @@ def _check_qos(node: Node) -> None:
         if first != 'qos_overrides':
             continue
         if policy in _QOS:
-            choices = [c for c in _QOS[policy].short_keys() if c != 'unknown'] + ['auto'] * (policy == 'reliability' and '.subscription.' in name)
+            choices = ([c for c in _QOS[policy].short_keys() if c != 'unknown']
+                       + ['auto'] * (policy == 'reliability' and '.subscription.' in name))
             if value not in choices:
                 raise ConfigError(f'{name}: must be one of {", ".join(choices)}, got {value!r}')
         elif policy == 'depth' and (type(value) is not int or not 0 <= value <= MAX_DEPTH):
@@ -69,7 +73,8 @@ def descriptor(f: dataclasses.Field) -> ParameterDescriptor:
     """What ROS tools can know of a parameter: type, description with unit, range, constraints."""
     m = f.metadata
     unit = f' ({m["unit"]})' if m['unit'] else ''
-    d = ParameterDescriptor(name=f.name, type=_type(f).value, description=m['description'] + unit, additional_constraints=constraint(f))
+    d = ParameterDescriptor(name=f.name, type=_type(f).value, description=m['description'] + unit,
+                            additional_constraints=constraint(f))
     if m['low'] is not None and _type(f) is Parameter.Type.DOUBLE:
         d.floating_point_range = [FloatingPointRange(from_value=m['low'], to_value=m['high'])]
     if m['low'] is not None and _type(f) is Parameter.Type.INTEGER:
@@ -83,8 +88,10 @@ def changed(config: Config, parameters: list[Parameter]) -> Config:
 
 
 def as_declared(parameters: list[Parameter]) -> list[Parameter]:
-    """The same parameters, with whole numbers as real ones and an empty list as an empty one of numbers where that is the declared type."""
-    return [_parameter(_FIELDS[p.name], _plain(p.value)) if p.name in _FIELDS and _convertible(_FIELDS[p.name], p) else p for p in parameters]
+    """The same parameters, with whole numbers as real ones and an empty list as an empty one of numbers where that is
+    the declared type."""
+    return [_parameter(_FIELDS[p.name], _plain(p.value)) if p.name in _FIELDS and _convertible(_FIELDS[p.name], p)
+            else p for p in parameters]
 
 
 def _type(f: dataclasses.Field) -> Parameter.Type:

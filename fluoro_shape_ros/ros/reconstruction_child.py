@@ -1,4 +1,5 @@
-"""The other end of reconstruction_process: a process that reconstructs pair after pair. It ends when the one that began it does, however that ends."""
+"""The other end of reconstruction_process: a process that reconstructs pair after pair. It ends when the one that began
+it does, however that ends."""
 
 from __future__ import annotations
 
@@ -53,7 +54,8 @@ def end_with(parent: int) -> None:
 def serve(connection: Connection, images: SeenArrays, masks: SeenArrays) -> None:
     """Answer each Task with a Reconstruction and how long it took, s, or with a Bug.
 
-    A search that was cut short stays here: it is large, and made of steps that can't travel. What travels in its place is a number.
+    A search that was cut short stays here: it is large, and made of steps that can't travel. What travels in its place
+    is a number.
     """
     kept, number, threads, collected = None, 0, None, time.monotonic()
     connection.send(READY)
@@ -64,10 +66,12 @@ def serve(connection: Connection, images: SeenArrays, masks: SeenArrays) -> None
         if config.input.threads != threads:
             threads = config.input.threads
             cv2.setNumThreads(threads or -1)        # 0 would mean none for OpenCV
-        prior = replace(task.prior, masks=task.prior.masks and masks.at(task.prior.masks), search=kept if task.prior.search == number else None)
+        prior = replace(task.prior, masks=task.prior.masks and masks.at(task.prior.masks),
+                        search=kept if task.prior.search == number else None)
         kept = None
         try:
-            result: Reconstruction = reconstruct(Frame(task.stamp_ns, task.frame_id, images.at(task.images), views), config, prior, task.until)
+            result: Reconstruction = reconstruct(Frame(task.stamp_ns, task.frame_id, images.at(task.images), views),
+                                                 config, prior, task.until)
         except Exception as error:  # the node tells it, and the next pair goes on
             connection.send(Bug.of(error))
             continue

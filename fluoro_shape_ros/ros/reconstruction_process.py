@@ -1,6 +1,8 @@
-"""A process that reconstructs, from the side of the one that begins it: what goes to and fro, and how it is asked, watched and ended. Nothing here imports ROS.
+"""A process that reconstructs, from the side of the one that begins it: what goes to and fro, and how it is asked,
+watched and ended. Nothing here imports ROS.
 
-Images go through memory that both see; all else is small, and goes pickled through a pipe. The other side is reconstruction_child.
+Images go through memory that both see; all else is small, and goes pickled through a pipe. The other side is
+reconstruction_child.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ class Task:
     stamp_ns: int
     frame_id: str
     images: tuple[Place, Place]
-    known: bytes                # views and Config, pickled: what stays the same is the same object again at the other end
+    known: bytes                # views and Config, pickled: what stays the same is the same object again at the other
+                                # end
     prior: Prior                # its masks are Places
     until: float | None
 
@@ -47,7 +50,8 @@ class Bug:
     @classmethod
     def of(cls, error: Exception) -> Bug:
         place, name = traceback.extract_tb(error.__traceback__)[-1], type(error).__name__
-        return cls(f'{name} in {place.filename}:{place.lineno}', f'{name}: {error}', ''.join(traceback.format_exception(error)))
+        return cls(f'{name} in {place.filename}:{place.lineno}', f'{name}: {error}',
+                   ''.join(traceback.format_exception(error)))
 
 
 class BugThere(Exception):
@@ -63,7 +67,8 @@ class Lost(Exception):
 
 
 class Child:
-    """One such process; `fds` are the memory that it sees. Raises OSError where it can't be begun. It ends when this one does, however that ends."""
+    """One such process; `fds` are the memory that it sees. Raises OSError where it can't be begun. It ends when this
+    one does, however that ends."""
 
     def __init__(self, fds: tuple[int, ...]):
         self._pipe, theirs = Pipe()
@@ -72,8 +77,10 @@ class Child:
             handed = (theirs.fileno(), *fds)
             # in a process group of its own: Ctrl-C in the terminal is for the node, which may still want an answer
             self._process = subprocess.Popen(
-                [sys.executable, '-P', '-m', f'{__package__}.reconstruction_child', str(os.getpid()), *map(str, handed)], pass_fds=handed, process_group=0,
-                stdin=subprocess.DEVNULL, env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(os.path.abspath, sys.path))})
+                [sys.executable, '-P', '-m', f'{__package__}.reconstruction_child',
+                 str(os.getpid()), *map(str, handed)], pass_fds=handed,
+                process_group=0, stdin=subprocess.DEVNULL,
+                env={**os.environ, 'PYTHONPATH': os.pathsep.join(map(os.path.abspath, sys.path))})
         except BaseException:
             self._pipe.close()
             raise
@@ -90,7 +97,8 @@ class Child:
             self._heard(0.0)
 
     def ask(self, task: Task, limit_s: float | None, meanwhile: Callable[[], None]) -> tuple[Reconstruction, float]:
-        """The answer to a task, and how long it took over there, s; `meanwhile` is called once it is under way. Raises Lost, and BugThere."""
+        """The answer to a task, and how long it took over there, s; `meanwhile` is called once it is under way. Raises
+        Lost, and BugThere."""
         try:
             self._pipe.send(task)
         except OSError:
@@ -116,7 +124,8 @@ class Child:
         self._pipe.close()
 
     def _heard(self, limit_s: float | None):
-        """What it says next, in limit_s at most during which it could have run: where others take all cores it does not hang. Raises Lost."""
+        """What it says next, in limit_s at most during which it could have run: where others take all cores it does not
+        hang. Raises Lost."""
         left_s, starved_s = limit_s, self._starved_s()
         try:
             while not self._pipe.poll(left_s):

@@ -1,7 +1,8 @@
-"""Where pairs are reconstructed: in a process of its own that is begun anew where it hangs or dies, or, where there can be none, here. Nothing here imports ROS.
+"""Where pairs are reconstructed: in a process of its own that is begun anew where it hangs or dies, or, where there can
+be none, here. Nothing here imports ROS.
 
-Python lets one thread at a time run: in one process, messages that come hold up the pair at work, and the pair holds them up. A process of its own can be
-ended, too, and a library that crashes in it does not take the node along.
+Python lets one thread at a time run: in one process, messages that come hold up the pair at work, and the pair holds
+them up. A process of its own can be ended, too, and a library that crashes in it does not take the node along.
 """
 
 from __future__ import annotations
@@ -36,17 +37,19 @@ def why_not() -> str:
 
 
 def patience_s(config: Config, pixels: int) -> float | None:
-    """How long a pair may take before it is said to hang, by the pixels of its larger image: a step of the search has no look at the clock, and takes the
-    longer the more of them there are. None where there is no limit: `time_budget` is 0, or does not count, as for method:=paper."""
+    """How long a pair may take before it is said to hang, by the pixels of its larger image: a step of the search has
+    no look at the clock, and takes the longer the more of them there are. None where there is no limit: `time_budget`
+    is 0, or does not count, as for method:=paper."""
     budget = config.input.time_budget
     return 2 * budget + max(1.0, pixels / MANY) if budget and config.curve.method != 'paper' else None
 
 
 class Reconstructor:
-    """pipeline.reconstruct, in a process of its own where that can work; else in the thread that calls it, and `here` says why.
+    """pipeline.reconstruct, in a process of its own where that can work; else in the thread that calls it, and `here`
+    says why.
 
-    A context manager: what was begun is ended when it is left. For one thread, except `end`. `told` is called with the reason whenever a process was lost;
-    `took_s` is how long the last pair took, without its way there and back.
+    A context manager: what was begun is ended when it is left. For one thread, except `end`. `told` is called with the
+    reason whenever a process was lost; `took_s` is how long the last pair took, without its way there and back.
     """
 
     _memory: tuple[SharedArrays, ...]
@@ -55,7 +58,8 @@ class Reconstructor:
     def __init__(self):
         self.here, self.told, self.took_s = '', lambda reason: None, 0.0
         self._child, self._ended, self._changing, self._failed_starts = None, False, threading.Lock(), 0
-        self._memory, self._masks, self._mask_places = (), None, ()     # of images and of masks; which masks are there, and where
+        # of images and of masks; which masks are there, and where
+        self._memory, self._masks, self._mask_places = (), None, ()
         why = why_not()
         if why:
             self._stay_here(why)
@@ -79,7 +83,8 @@ class Reconstructor:
                 self._child.kill()
 
     def get_ready(self) -> float:
-        """Wait until a pair can be handed over; for how long that was, s. A process that died meanwhile is begun anew."""
+        """Wait until a pair can be handed over; for how long that was, s. A process that died meanwhile is begun
+        anew."""
         start = time.monotonic()
         while not (self.here or self._ended):
             try:
@@ -102,7 +107,8 @@ class Reconstructor:
             return result
         try:
             task = self._task(frame, config, prior, until and until + waited_s)
-            result, self.took_s = self._child.ask(task, patience_s(config, max(image.size for image in frame.images)), meanwhile)
+            result, self.took_s = self._child.ask(task, patience_s(config, max(image.size for image in frame.images)),
+                                                  meanwhile)
             return result
         except Lost as error:
             self._begin_anew(str(error))
@@ -113,7 +119,8 @@ class Reconstructor:
         if prior.masks is not self._masks:
             self._masks, self._mask_places = prior.masks, masks.put(prior.masks or ())
         places = images.put(frame.images)
-        return Task(frame.stamp_ns, frame.frame_id, places, _pickled(frame.views, config), replace(prior, masks=self._mask_places or None), until)
+        return Task(frame.stamp_ns, frame.frame_id, places, _pickled(frame.views, config),
+                    replace(prior, masks=self._mask_places or None), until)
 
     def _begin_anew(self, reason: str) -> None:
         self._failed_starts += not self._child.ready

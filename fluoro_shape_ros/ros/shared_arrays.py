@@ -1,4 +1,5 @@
-"""Arrays that another process sees without a copy. They lie in memory of no name (memfd_create(2)), so that nothing of it is left once both have ended, however they did."""
+"""Arrays that another process sees without a copy. They lie in memory of no name (memfd_create(2)), so that nothing of
+it is left once both have ended, however they did."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ class SharedArrays:
         self._memory, self._size = None, 0
 
     def put(self, arrays: Sequence[np.ndarray]) -> tuple[Any, ...]:
-        """Write arrays over those before, which nobody may be reading any more; where they lie now. There is as much memory as the most of them needed."""
+        """Write arrays over those before, which nobody may be reading any more; where they lie now. There is as much
+        memory as the most of them needed."""
         places, stop = [], 0
         for array in arrays:
             places.append(Place(-(-stop // ALIGNED) * ALIGNED, array.shape, array.dtype.str))

@@ -48,7 +48,8 @@ def path_of(data: bytes) -> Path:
 class AdaptiveSubscription:
     """A subscription that is reliable, until a publisher offers only best-effort: then it is remade so, by itself.
 
-    With no publisher left it is reliable again. `image_reliability` other than auto, or a QoS override of the reliability, fixes it.
+    With no publisher left it is reliable again. `image_reliability` other than auto, or a QoS override of the
+    reliability, fixes it.
     """
 
     def __init__(self, node: Node, msg_type, topic: str, callback: Callable, depth: int, image_reliability: str):
@@ -96,7 +97,8 @@ class AdaptiveSubscription:
             policy = QoSPolicyKind(event.last_policy_kind).name.lower()
             self._node.get_logger().warning(f'{topic}: a publisher offers an incompatible {policy}: it is not heard')
         elif not self.best_effort:
-            self._node.get_logger().warning(f'{topic}: a publisher offers only best-effort: taking that, images may get lost')
+            self._node.get_logger().warning(f'{topic}: a publisher offers only best-effort: '
+                                            'taking that, images may get lost')
             self._make(QoSReliabilityPolicy.BEST_EFFORT)
 
     def _matched(self, event) -> None:
@@ -111,7 +113,8 @@ def _reliability(node: Node, topic: str, image_reliability: str) -> str:
     """
     name = f'qos_overrides.{topic}.subscription.reliability'
     if not node.has_parameter(name):
-        node.declare_parameter(name, 'auto', ParameterDescriptor(description='reliable, best_effort, or auto: as image_reliability says', read_only=True))
+        node.declare_parameter(name, 'auto', ParameterDescriptor(description='reliable, best_effort, or auto: as '
+                                                                             'image_reliability says', read_only=True))
     value = node.get_parameter(name).value
     if value not in RELIABILITIES:
         raise InvalidQosOverridesError(f'{name}: must be one of {", ".join(RELIABILITIES)}, got {value!r}')
@@ -119,17 +122,21 @@ def _reliability(node: Node, topic: str, image_reliability: str) -> str:
 
 
 class Inputs:
-    """The images and camera infos of both planes; `on_image(plane, msg)` and `on_camera_info(plane, msg)` get what comes."""
+    """The images and camera infos of both planes; `on_image(plane, msg)` and `on_camera_info(plane, msg)` get what
+    comes."""
 
-    def __init__(self, node: Node, image_transport: str, image_reliability: str, on_image: Callable, on_camera_info: Callable):
+    def __init__(self, node: Node, image_transport: str, image_reliability: str, on_image: Callable,
+                 on_camera_info: Callable):
         # camera infos first: the executor takes them in this order, and an image needs its camera
-        self._infos = {plane: AdaptiveSubscription(node, CameraInfo, f'plane_{plane}/camera_info', partial(on_camera_info, plane), INFO_DEPTH, image_reliability)
+        self._infos = {plane: AdaptiveSubscription(node, CameraInfo, f'plane_{plane}/camera_info',
+                                                   partial(on_camera_info, plane), INFO_DEPTH, image_reliability)
                        for plane in PLANES}
         kind, suffix = (CompressedImage, '/compressed') if image_transport == 'compressed' else (Image, '')
         self._images = {}
         for plane in PLANES:    # beside the image wherever that was remapped to, as image_transport does it
             topic = node.resolve_topic_name(f'plane_{plane}/image_raw') + suffix
-            self._images[plane] = AdaptiveSubscription(node, kind, topic, partial(on_image, plane), IMAGE_DEPTH, image_reliability)
+            self._images[plane] = AdaptiveSubscription(node, kind, topic, partial(on_image, plane), IMAGE_DEPTH,
+                                                       image_reliability)
         self._publishers = dict.fromkeys(PLANES, 0)
 
     def destroy(self) -> None:
@@ -148,7 +155,8 @@ class Inputs:
     def known(self, plane: str) -> dict:
         """What a PlaneSummary tells of them."""
         images = self._images[plane]
-        return dict(unheard=partial(self._unheard, plane), reliability='best_effort' if images.best_effort else 'reliable', fell_back=images.fell_back,
+        return dict(unheard=partial(self._unheard, plane),
+                    reliability='best_effort' if images.best_effort else 'reliable', fell_back=images.fell_back,
                     publishers=self._publishers[plane])
 
     def _unheard(self, plane: str) -> str:

@@ -24,13 +24,16 @@ def import_tf():
     try:
         return importlib.import_module('tf2_ros')
     except ImportError as error:
-        raise TfMissing(f'geometry: tf needs tf2_ros, which is not installed here ({error}); it comes with ROS 2 (package tf2_ros_py), not from PyPI') from error
+        raise TfMissing(f'geometry: tf needs tf2_ros, which is not installed here ({error}); '
+                        'it comes with ROS 2 (package tf2_ros_py), not from PyPI') from error
 
 
 class TfPoses:
-    """What tf tells `node` of poses: a Lookup, (reference frame, camera frame, stamp_ns) -> camera_from_reference as R, t in nested tuples.
+    """What tf tells `node` of poses: a Lookup, (reference frame, camera frame, stamp_ns) -> camera_from_reference as R,
+    t in nested tuples.
 
-    It waits up to PATIENCE_S for a pose to come, so it may not be called from the node's own executor, and raises NoTransform. Making it raises TfMissing.
+    It waits up to PATIENCE_S for a pose to come, so it may not be called from the node's own executor, and raises
+    NoTransform. Making it raises TfMissing.
     """
 
     def __init__(self, node: Node):
@@ -42,7 +45,8 @@ class TfPoses:
         if not camera:
             raise NoTransform('CameraInfo has no frame_id to look up')
         try:
-            t = self._buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns), Duration(seconds=PATIENCE_S)).transform
+            t = self._buffer.lookup_transform(camera, reference, Time(nanoseconds=stamp_ns),
+                                              Duration(seconds=PATIENCE_S)).transform
         except self._tf2_ros.TransformException as error:
             raise NoTransform(f'{camera} from {reference}: {error}') from error
         q, p = t.rotation, t.translation
@@ -50,5 +54,6 @@ class TfPoses:
         return tuple(map(tuple, R.tolist())), (p.x, p.y, p.z)
 
     def forget(self) -> None:
-        """Forget poses that change with time: tf takes none that are older than what it has, as they are after a bag has looped."""
+        """Forget poses that change with time: tf takes none that are older than what it has, as they are after a bag
+        has looped."""
         self._buffer.clear()

@@ -11,7 +11,8 @@ from .pairing import JUMP_NS
 
 BUFFER = 8              # changes of a plane's camera that are known, pairs that wait for their cameras
 RECENT = 64             # stamps of cameras that are known
-PATIENCE_S = 4.0        # for a camera info that should come with its image: what the middleware lost, it sends again within 3 s
+PATIENCE_S = 4.0        # for a camera info that should come with its image: what the middleware lost, it sends again
+                        # within 3 s
 LOSSY_PATIENCE_S = 0.2  # the same where it sends nothing again
 
 
@@ -54,7 +55,8 @@ class CameraBook:
         return self._cameras[-1] if self._cameras else None
 
     def awaits(self, stamp_ns: int) -> bool:
-        """Whether an image came before its camera: there is none at all, or most come with their images and this one's is still on its way."""
+        """Whether an image came before its camera: there is none at all, or most come with their images and this one's
+        is still on its way."""
         if stamp_ns not in self._asked:
             self._asked.append(stamp_ns)
             self._settle()
@@ -68,7 +70,8 @@ class CameraBook:
         self._given_up = True
 
     def rewind(self, stamp_ns: int) -> None:
-        """The stamps jumped back to `stamp_ns`: forget later changes. With nothing else left, the newest camera goes on.
+        """The stamps jumped back to `stamp_ns`: forget later changes. With nothing else left,
+        the newest camera goes on.
 
         Cameras that are ahead by less than JUMP_NS have come from behind the jump already, before their images.
         """
@@ -101,7 +104,8 @@ class Pair:
 
 
 class WaitingRoom:
-    """Pairs whose cameras are still on their way; the newest one whose cameras are known goes first, and older ones never after it."""
+    """Pairs whose cameras are still on their way; the newest one whose cameras are known goes first, and older ones
+    never after it."""
 
     def __init__(self):
         self._pairs = deque(maxlen=BUFFER)
@@ -124,7 +128,8 @@ class WaitingRoom:
     def take(self, books: tuple[CameraBook, CameraBook], now: float, lossy: bool = False) -> tuple[Pair | None, int]:
         """The newest pair whose cameras are known, and the number of older ones given up for it.
 
-        After PATIENCE_S (LOSSY_PATIENCE_S where a lost camera info is `lossy`: lost for good) the newest pair goes without.
+        After PATIENCE_S (LOSSY_PATIENCE_S where a lost camera info is `lossy`: lost for good) the newest pair goes
+        without.
         """
         awaited = [[book.awaits(stamp) for book, stamp in zip(books, pair.stamps)] for pair in self._pairs]
         ready = [k for k, planes in enumerate(awaited) if not any(planes)]

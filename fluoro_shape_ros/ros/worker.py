@@ -1,4 +1,5 @@
-"""One pair at a time, the newest one: the thread that does the work, what it remembers, and messages into a Frame. Nothing here imports ROS."""
+"""One pair at a time, the newest one: the thread that does the work, what it remembers, and messages into a Frame.
+Nothing here imports ROS."""
 
 from __future__ import annotations
 
@@ -44,16 +45,19 @@ class Camera:
 
 
 def camera(msg, plane: str = '') -> Camera:
-    """The camera of a plane's sensor_msgs/CameraInfo, unchecked but for its lengths. Raises BadCameraInfo where these are absurd."""
+    """The camera of a plane's sensor_msgs/CameraInfo, unchecked but for its lengths. Raises BadCameraInfo where these
+    are absurd."""
     check_lengths(msg, plane)
-    content = (msg.header.frame_id, msg.height, msg.width, msg.distortion_model, *map(tuple, (msg.d, msg.k, msg.r, msg.p)))
+    content = (msg.header.frame_id, msg.height, msg.width, msg.distortion_model,
+               *map(tuple, (msg.d, msg.k, msg.r, msg.p)))
     roi = msg.roi
     return Camera((*content, msg.binning_x, msg.binning_y, roi.x_offset, roi.y_offset, roi.width, roi.height), msg)
 
 
 def checked_camera(msg, config: Config, plane: str = '') -> Camera:
     """The camera of a plane's CameraInfo that may serve once an image of its size comes. Raises BadCameraInfo."""
-    region = [(r or full) // max(b, 1) for r, full, b in zip((msg.roi.height, msg.roi.width), (msg.height, msg.width), (msg.binning_y, msg.binning_x))]
+    region = [(r or full) // max(b, 1) for r, full, b in zip((msg.roi.height, msg.roi.width), (msg.height, msg.width),
+                                                             (msg.binning_y, msg.binning_x))]
     pose = (np.eye(3), np.zeros(3)) if config.input.geometry == 'tf' else None
     camera_info_to_view(msg, plane, tuple(region), rectified=config.input.rectified, pose=pose)
     return camera(msg, plane)
@@ -88,17 +92,20 @@ class Job:
 
 
 ViewOf = Callable[..., View]        # (camera, plane, image_shape, rectified, pose) -> View
-Lookup = Callable[[str, str, int], tuple]   # (reference frame, camera frame, stamp_ns) -> camera_from_reference, raises NoTransform
+# (reference frame, camera frame, stamp_ns) -> camera_from_reference, raises NoTransform
+Lookup = Callable[[str, str, int], tuple]
 
 
 def view_of(camera: Camera, plane: str, image_shape: tuple[int, int], rectified: bool, pose=None) -> View:
-    """The View of a camera; `pose` is R, t of camera_from_reference as nested tuples. All arguments are hashable: worth a cache."""
+    """The View of a camera; `pose` is R, t of camera_from_reference as nested tuples. All arguments are hashable: worth
+    a cache."""
     pose = None if pose is None else tuple(map(np.array, pose))
     return camera_info_to_view(camera.msg, plane, image_shape, rectified=rectified, pose=pose)
 
 
 def decode(msg) -> np.ndarray:
-    """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage, or of what was decoded before. Raises BadImage."""
+    """(H, W) uint8, uint16 or float32 of a sensor_msgs/Image or CompressedImage, or of what was decoded before. Raises
+    BadImage."""
     if isinstance(msg, np.ndarray):
         return msg
     if isinstance(msg, Oversized):
@@ -123,8 +130,10 @@ def adapt(job: Job, view_of: ViewOf, lookup: Lookup, tally: Tally) -> Frame | Re
         return Reconstruction(Outcome.NO_CAMERA_INFO, f'{" and ".join(missing)}: no valid camera info yet')
     given = job.config.input
     try:
-        poses = [lookup(job.frame_id, c.msg.header.frame_id, stamp_ns(image)) if given.geometry == 'tf' else None for c, image in zip(job.cameras, job.images)]
-        views = tuple(view_of(c, plane, image.shape, given.rectified, pose) for c, plane, image, pose in zip(job.cameras, PLANES, images, poses))
+        poses = [lookup(job.frame_id, c.msg.header.frame_id, stamp_ns(image)) if given.geometry == 'tf' else None
+                 for c, image in zip(job.cameras, job.images)]
+        views = tuple(view_of(c, plane, image.shape, given.rectified, pose)
+                      for c, plane, image, pose in zip(job.cameras, PLANES, images, poses))
     except NoTransform as error:
         return Reconstruction(Outcome.NO_TRANSFORM, str(error))
     except BadCameraInfo as error:
@@ -202,13 +211,15 @@ class Memory:
         with self._lock:
             if self._masks is not None and window != self._window:
                 self._masks, self.note = None, 'mask cleared: the size or region of the images changed'
-            known = [(shape, stamp_ns) for shape, stamp_ns, frame_id in self._last if job.config.curve.tracking and frame_id == frame.frame_id]
+            known = [(shape, stamp_ns) for shape, stamp_ns, frame_id in self._last
+                     if job.config.curve.tracking and frame_id == frame.frame_id]
             before, previous = [(None, None)] * (2 - len(known)) + known
             points, fault = _predicted(job, frame)
             return Prior(previous[0], previous[1], before[0], before[1], self._masks, points, fault, self._search)
 
     def remember(self, job: Job, frame: Frame, result: Reconstruction) -> bool:
-        """Keep the shape of a result for the next pair; False where the result is out of date and must not be published."""
+        """Keep the shape of a result for the next pair; False where the result is out of date and must not be
+        published."""
         with self._lock:
             if job.generation != self.generation:
                 return False
@@ -237,11 +248,12 @@ def _predicted(job: Job, frame: Frame) -> tuple[np.ndarray | None, str]:
 class Worker:
     """A thread that works on the newest job offered; a job that nobody got to is overtaken by the next.
 
-    An exception of `work(job)` goes to `failed(job, error)` and the next job goes on. `get_ready(waits)` is called before each, and every LOOK_S while none
-    waits.
+    An exception of `work(job)` goes to `failed(job, error)` and the next job goes on. `get_ready(waits)` is called
+    before each, and every LOOK_S while none waits.
     """
 
-    def __init__(self, work: Callable[[Job], None], failed: Callable[[Job, Exception], None], get_ready: Callable[[bool], None] = lambda waits: None):
+    def __init__(self, work: Callable[[Job], None], failed: Callable[[Job, Exception], None],
+                 get_ready: Callable[[bool], None] = lambda waits: None):
         self._work, self._failed, self._get_ready = work, failed, get_ready
         self._changed = threading.Condition()
         self._job: Job | None = None

@@ -1,7 +1,7 @@
 """What else stands in the beam: anatomy-like backgrounds and clutter, as pure functions of a random generator.
 
-Each gives the transmitted share of the beam as a (H, W) float32 image, so that they combine by multiplication. Sizes scale with the
-image. Nothing here is meant to be a particular patient; it is meant to be as much in the way as one.
+Each gives the transmitted share of the beam as a (H, W) float32 image, so that they combine by multiplication. Sizes
+scale with the image. Nothing here is meant to be a particular patient; it is meant to be as much in the way as one.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ def leads(rng: np.random.Generator, shape: tuple[int, int], count: int = 2) -> n
         wire = _winding(rng, shape, 0.12)[:rng.integers(90, 160)]
         shadow = np.zeros(shape, np.uint8)
         cv2.polylines(shadow, [np.rint(wire * 16).astype(np.int32)], False, 255, max(1, round(width)), cv2.LINE_AA, 4)
-        cv2.circle(shadow, tuple(int(x) for x in np.rint(wire[-1] * 16)), round(5 * width * 16), 255, -1, cv2.LINE_AA, 4)
+        cv2.circle(shadow, tuple(int(x) for x in np.rint(wire[-1] * 16)), round(5 * width * 16), 255, -1,
+                   cv2.LINE_AA, 4)
         beam *= 1 - shadow * np.float32(rng.uniform(0.15, 0.4) / 255)
     return beam
 
@@ -83,7 +84,8 @@ def blades(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     """Collimator: four straight blades that leave a slightly turned rectangle open; 0.02 behind them."""
     h, w = shape
     left, right, top, bottom = rng.uniform(0.03, 0.12, 4)
-    corners = np.array([[left * w, top * h], [(1 - right) * w, top * h], [(1 - right) * w, (1 - bottom) * h], [left * w, (1 - bottom) * h]])
+    corners = np.array([[left * w, top * h], [(1 - right) * w, top * h], [(1 - right) * w, (1 - bottom) * h],
+                        [left * w, (1 - bottom) * h]])
     turn = rng.uniform(-0.03, 0.03)
     middle = np.array([w / 2, h / 2])
     corners = (corners - middle) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + middle
@@ -109,8 +111,10 @@ def occluder(rng: np.random.Generator, shape: tuple[int, int], centre_px: np.nda
     return plate(shape, centre_px, size_px, turn, 1 - rng.uniform(0.85, 0.95))
 
 
-def plate(shape: tuple[int, int], centre_px: np.ndarray, size_px: tuple[float, float], turn: float, share: float) -> np.ndarray:
-    """A rectangle about `centre_px` (u, v) that lets `share` through; its first side lies at `turn` rad from u towards v."""
+def plate(shape: tuple[int, int], centre_px: np.ndarray, size_px: tuple[float, float], turn: float,
+          share: float) -> np.ndarray:
+    """A rectangle about `centre_px` (u, v) that lets `share` through; its first side lies at `turn` rad from u towards
+    v."""
     box = (tuple(float(c) for c in centre_px), tuple(float(n) for n in size_px), float(np.rad2deg(turn)))
     drawn = np.zeros(shape, np.uint8)
     cv2.fillConvexPoly(drawn, np.rint(cv2.boxPoints(box) * 16).astype(np.int32), 255, cv2.LINE_AA, 4)
@@ -143,15 +147,18 @@ def _winding(rng: np.random.Generator, shape: tuple[int, int], sway: float) -> n
     along = np.linspace(-0.75, 0.75, 6)
     across = np.cumsum(rng.normal(0, sway, 6)) + rng.uniform(-0.3, 0.3)
     direction, normal = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
-    knots = (along[:, None] * direction + (across - across.mean())[:, None] * normal + rng.normal(0, 0.15) * normal) * max(h, w)
+    knots = (along[:, None] * direction + (across - across.mean())[:, None] * normal
+             + rng.normal(0, 0.15) * normal) * max(h, w)
     return CubicSpline(along, knots)(np.linspace(-0.75, 0.75, 200)) + [w / 2, h / 2]
 
 
 def _tube_depth(curve: np.ndarray, outer: float, inner: float, shape: tuple[int, int]) -> np.ndarray:
-    """(H/2, W/2) px: path length across a tube (hollow for inner > 0) about an (N, 2) u, v curve of the full-size image."""
+    """(H/2, W/2) px: path length across a tube (hollow for inner > 0) about an (N, 2) u, v curve of the full-size
+    image."""
     off = np.full(_half(shape), 255, np.uint8)
     cv2.polylines(off, [np.rint(curve * 8).astype(np.int32)], False, 0, 1, cv2.LINE_8, 4)
-    d2 = (2 * np.minimum(cv2.distanceTransform(off, cv2.DIST_L2, 5), np.float32(outer)))**2     # no curve in sight: far away
+    # no curve in sight: far away
+    d2 = (2 * np.minimum(cv2.distanceTransform(off, cv2.DIST_L2, 5), np.float32(outer)))**2
     depth = 2 * (np.sqrt(np.maximum(outer**2 - d2, 0)) - np.sqrt(np.maximum(inner**2 - d2, 0)))
     return cv2.GaussianBlur(depth, (0, 0), 1.0)
 

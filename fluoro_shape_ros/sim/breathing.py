@@ -1,11 +1,13 @@
-"""A background that breathes and beats: one picture of the anatomy, larger than the field, moved by a smooth field of displacements.
+"""A background that breathes and beats: one picture of the anatomy, larger than the field, moved by a smooth field of
+displacements.
 
 At t s of a run a pixel x shows the picture's x - d(x, t), where
 
     d = breath (1 - cos(2 pi t BREATHS + phase)) / 2 w(x) e_v + beat sin(2 pi t BEATS + phase') h(x) e + moved
 
-w rises from QUIET at the head's end of the field to 1 below the diaphragm; h is 1 at the heart and falls off around it; e is a direction, and `moved`
-how far the patient has moved on the table. What is `still`, a spine, only moves with the patient.
+w rises from QUIET at the head's end of the field to 1 below the diaphragm; h is 1 at the heart and falls off around it;
+e is a direction, and `moved` how far the patient has moved on the table. What is `still`, a spine, only moves with the
+patient.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ DOME = 0.4, 0.9                     # optical depth of what lies below a drawn d
 class Breathing:
     """What a plane sees behind the device."""
 
-    picture: np.ndarray         # (H + 2 MARGIN_PX, W + 2 MARGIN_PX) float32, the share of the beam that passes what moves
+    picture: np.ndarray         # (H + 2 MARGIN_PX, W + 2 MARGIN_PX) float32, the share of the beam that passes what
+                                # moves
     still: np.ndarray           # the same size, what passes the rest
     breath: np.ndarray          # (H, W) float32, w
     breath_px: float
@@ -50,7 +53,8 @@ class Breathing:
         """(H, W) float32 each: how far what moves stands off its place at `t` s, along u and v, px."""
         inhaled = self.breath_px * (1 - np.cos(2 * np.pi * BREATHS * t + self.breath_phase)) / 2
         pulse = np.sin(2 * np.pi * BEATS * t + self.beat_phase)
-        u, v = (self.beat * np.float32(pulse * beat) + np.float32(moved) for beat, moved in zip(self.beat_px, self.moved_px))
+        u, v = (self.beat * np.float32(pulse * beat) + np.float32(moved)
+                for beat, moved in zip(self.beat_px, self.moved_px))
         return u, v + self.breath * np.float32(inhaled)
 
     def at(self, t: float) -> np.ndarray:
@@ -60,7 +64,8 @@ class Breathing:
         aside, down = self.displacement(t)
         moving = cv2.remap(self.picture, u - aside, v - down, cv2.INTER_CUBIC)
         off = np.array([[1, 0, MARGIN_PX - self.moved_px[0]], [0, 1, MARGIN_PX - self.moved_px[1]]], np.float32)
-        return np.maximum(moving, 0) * cv2.warpAffine(self.still, off, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        return np.maximum(moving, 0) * cv2.warpAffine(self.still, off, (w, h),
+                                                      flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
     def shifted(self, moved_px: tuple[float, float]) -> Breathing:
         """The same once the patient has moved by (u, v) px."""
@@ -71,20 +76,23 @@ Patient = Callable[[int, float], Breathing]     # (plane 0 or 1, energy in keV) 
 
 
 def patient(rng: np.random.Generator, views: tuple[View, View], volume: ct.Volume | None = None) -> Patient:
-    """What both planes see of one patient, who breathes and whose heart beats: a CT volume, that is projected once, or drawn anatomy. Raises ValueError as
-    ct.path_lengths does."""
+    """What both planes see of one patient, who breathes and whose heart beats: a CT volume, that is projected once, or
+    drawn anatomy. Raises ValueError as ct.path_lengths does."""
     phases, seed = tuple(rng.uniform(0, 2 * np.pi, 2)), int(rng.integers(2**31))
     if volume is None:
         return lambda i, energy_kev: _drawn(np.random.default_rng([seed, i]), views[i], energy_kev, phases)
     where = ct.draw_placement(rng, volume)
     lengths = [ct.path_lengths(volume, _larger(view), where) for view in views]
-    return lambda i, energy_kev: _in_ct(np.random.default_rng([seed, i]), views[i], cv2.exp(-ct.optical_depth(lengths[i], energy_kev)), phases)
+    return lambda i, energy_kev: _in_ct(np.random.default_rng([seed, i]), views[i],
+                                        cv2.exp(-ct.optical_depth(lengths[i], energy_kev)), phases)
 
 
 def _drawn(rng: np.random.Generator, view: View, energy_kev: float, phases: tuple[float, float]) -> Breathing:
-    """Drawn tissue, ribs, vessels and a diaphragm that move, before a spine that is still; they attenuate as water does."""
+    """Drawn tissue, ribs, vessels and a diaphragm that move, before a spine that is still; they attenuate as water
+    does."""
     size, diaphragm = (view.height + 2 * MARGIN_PX, view.width + 2 * MARGIN_PX), rng.uniform(*DIAPHRAGM)
-    picture = anatomy.tissue(rng, size) * anatomy.ribs(rng, size) * anatomy.vessels(rng, size) * _dome(rng, size, MARGIN_PX + diaphragm * view.height)
+    picture = (anatomy.tissue(rng, size) * anatomy.ribs(rng, size) * anatomy.vessels(rng, size)
+               * _dome(rng, size, MARGIN_PX + diaphragm * view.height))
     power = np.float32(rng.uniform(*DENSITY) * water_attenuation(energy_kev) / water_attenuation(REFERENCE_KEV))
     return Breathing(picture**power, anatomy.spine(rng, size)**power, **_moves(rng, view, diaphragm, phases))
 
@@ -95,7 +103,8 @@ def _in_ct(rng: np.random.Generator, view: View, picture: np.ndarray, phases: tu
 
 
 def _larger(view: View) -> View:
-    return View(view.name, view.P + np.outer([MARGIN_PX, MARGIN_PX, 0.0], view.P[2]), view.width + 2 * MARGIN_PX, view.height + 2 * MARGIN_PX)
+    return View(view.name, view.P + np.outer([MARGIN_PX, MARGIN_PX, 0.0], view.P[2]), view.width + 2 * MARGIN_PX,
+                view.height + 2 * MARGIN_PX)
 
 
 def _moves(rng: np.random.Generator, view: View, diaphragm: float, phases: tuple[float, float]) -> dict:
@@ -106,8 +115,9 @@ def _moves(rng: np.random.Generator, view: View, diaphragm: float, phases: tuple
     heart, turn = rng.uniform(0.3, 0.7, 2) * [w, h], rng.uniform(0, 2 * np.pi)
     beat = np.exp(-((u - heart[0])**2 + (v - heart[1])**2) / (2 * (HEART * w)**2))
     px = rng.uniform(*BEAT_PX)
-    return dict(breath=(QUIET + (1 - QUIET) * below).astype(np.float32), breath_px=float(rng.uniform(*BREATH_PX)), breath_phase=float(phases[0]),
-                beat=beat.astype(np.float32), beat_px=(float(px * np.cos(turn)), float(px * np.sin(turn))), beat_phase=float(phases[1]))
+    return dict(breath=(QUIET + (1 - QUIET) * below).astype(np.float32), breath_px=float(rng.uniform(*BREATH_PX)),
+                breath_phase=float(phases[0]), beat=beat.astype(np.float32),
+                beat_px=(float(px * np.cos(turn)), float(px * np.sin(turn))), beat_phase=float(phases[1]))
 
 
 def _dome(rng: np.random.Generator, shape: tuple[int, int], top_px: float) -> np.ndarray:

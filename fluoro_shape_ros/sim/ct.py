@@ -1,12 +1,13 @@
 """Real anatomy in the beam: a CT volume, projected from the source of any view.
 
-Two materials: what stands along a ray is so much water and so much bone (the two line integrals of Joseph and Spital, J. Comput. Assist. Tomogr. 2
-(1978) 100), since bone, heavier in its atoms, gains more than water where the energy falls. A CT measures (1 + HU / 1000) times the attenuation of
-water, at its own energy (CT_KEV). Up to BONE_FROM that is water of so much density. Above it is a mixture, by volume, of tissue at BONE_FROM and of
-pure cortical bone at CORTICAL (1590 HU), and yet above bone alone, denser. So at CT_KEV both together attenuate just what was measured.
+Two materials: what stands along a ray is so much water and so much bone (the two line integrals of Joseph and Spital,
+J. Comput. Assist. Tomogr. 2 (1978) 100), since bone, heavier in its atoms, gains more than water where the energy
+falls. A CT measures (1 + HU / 1000) times the attenuation of water, at its own energy (CT_KEV). Up to BONE_FROM that is
+water of so much density. Above it is a mixture, by volume, of tissue at BONE_FROM and of pure cortical bone at CORTICAL
+(1590 HU), and yet above bone alone, denser. So at CT_KEV both together attenuate just what was measured.
 
-The volume is cut across the axis that the rays follow best. What a cut and the detector see of each other is a homography, so each cut is one
-warped image, and their sum the projection.
+The volume is cut across the axis that the rays follow best. What a cut and the detector see of each other is a
+homography, so each cut is one warped image, and their sum the projection.
 """
 
 from __future__ import annotations
@@ -31,17 +32,21 @@ CT_KEV = 70.0                       # effective energy of a CT at 120 kV
 BONE_FROM = 150.0                   # HU, above all soft tissue
 LARGEST_SPACING = 0.05              # m, between voxels; more was meant in mm
 STRAIGHT = 0.9999                   # cosine between an axis of the images and one of the patient
-UNEVEN = 0.1                        # of their mean: what distances between slices may be off, since positions are rounded
+UNEVEN = 0.1                        # of their mean: what distances between slices may be off,
+                                    # since positions are rounded
 BODY = -300.0                       # HU: body, or what it encloses
 COARSE = 0.004                      # m, voxels in which a body is looked for
 INSIDE = 0.04                       # m of an isocentre below the skin ...
 INSIDE_SHARE = 0.6                  # ... or, in a slight body, this share of the most that there is
 TURN = np.deg2rad(25)               # of a patient about each axis, either way
 PIXELS_A_VOXEL = 1.15               # at least, at the isocentre, that a projection is drawn with
-STRIDE = 2.0                        # voxels that a ray may pass over from one cut to the next; at many more, slanted surfaces show as stairs
-FLATTEST = 0.15                     # cosine of a ray to the axis that the volume is cut across; fields that wide are refused
+STRIDE = 2.0                        # voxels that a ray may pass over from one cut to the next; at many more, slanted
+                                    # surfaces show as stairs
+FLATTEST = 0.15                     # cosine of a ray to the axis that the volume is cut across;
+                                    # fields that wide are refused
 CT_IMAGE = '1.2.840.10008.5.1.4.1.1.2'
-KEYWORDS = ('SOPClassUID', 'ImageType', 'SeriesInstanceUID', 'ImagePositionPatient', 'ImageOrientationPatient', 'PixelSpacing', 'Rows', 'Columns')
+KEYWORDS = ('SOPClassUID', 'ImageType', 'SeriesInstanceUID', 'ImagePositionPatient', 'ImageOrientationPatient',
+            'PixelSpacing', 'Rows', 'Columns')
 
 
 class CtError(ValueError):
@@ -68,8 +73,10 @@ class Placement:
 
 
 def mass_attenuation(energy_kev: float) -> np.ndarray:
-    """(2,) m^2/kg of water and of bone, at an effective energy within ENERGIES_KEV; log-log between the tabulated ones."""
-    return 0.1 * np.array([np.exp(np.interp(np.log(energy_kev), np.log(ENERGIES_KEV), np.log(table))) for table in (WATER, BONE)])
+    """(2,) m^2/kg of water and of bone, at an effective energy within ENERGIES_KEV; log-log between the tabulated
+    ones."""
+    return 0.1 * np.array([np.exp(np.interp(np.log(energy_kev), np.log(ENERGIES_KEV), np.log(table)))
+                           for table in (WATER, BONE)])
 
 
 BONE_TO_WATER = float(np.divide(*mass_attenuation(CT_KEV)[::-1]))
@@ -86,7 +93,8 @@ def densities(hu: np.ndarray) -> np.ndarray:
 
 
 def optical_depth(lengths: np.ndarray, energy_kev: float) -> np.ndarray:
-    """(H, W) float32: the beam's attenuation, -ln of what is let through, at an effective energy within ENERGIES_KEV, of (H, W, 2) `path_lengths`."""
+    """(H, W) float32: the beam's attenuation, -ln of what is let through, at an effective energy within ENERGIES_KEV,
+    of (H, W, 2) `path_lengths`."""
     return lengths @ mass_attenuation(energy_kev).astype(np.float32)
 
 
@@ -96,9 +104,11 @@ def optical_depth(lengths: np.ndarray, energy_kev: float) -> np.ndarray:
 def path_lengths(volume: Volume, view: View, pose: Placement) -> np.ndarray:
     """(H, W, 2) float32: the mass of water and of bone along each pixel's ray, kg/m^2.
 
-    What lies behind the source does not count. Raises ValueError where the field is so wide that no axis of the volume follows all of its rays.
+    What lies behind the source does not count. Raises ValueError where the field is so wide that no axis of the volume
+    follows all of its rays.
     """
-    # a projection holds no more detail than its voxels: where they are large it is drawn in larger pixels, with one to spare on each side
+    # a projection holds no more detail than its voxels: where they are large it is drawn in larger pixels, with one to
+    # spare on each side
     voxel_px = pixels_per_metre(view.P, np.zeros((1, 3))) * volume.spacing_m.min()
     step = int(np.clip(voxel_px / PIXELS_A_VOXEL, 1, 4))
     shrink = np.array([[1 / step, 0, 0.5 / step + 0.5], [0, 1 / step, 0.5 / step + 0.5], [0, 0, 1]])
@@ -129,7 +139,9 @@ def _project(volume: Volume, view: View) -> np.ndarray:
         if rows.start < rows.stop and columns.start < columns.stop:
             size = columns.stop - columns.start, rows.stop - rows.start
             to_cut[:, 2] += to_cut @ [columns.start, rows.start, 0]
-            total[rows, columns] += cv2.warpPerspective(cut, to_cut, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)       # 0 beside the cut
+            # 0 beside the cut
+            total[rows, columns] += cv2.warpPerspective(cut, to_cut, size,
+                                                        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     v, u = np.mgrid[0:view.height, 0:view.width].astype(np.float32)
     rays = [np.float32(a[0]) * u + np.float32(a[1]) * v + np.float32(a[2]) for a in A]
     thickness = np.sqrt(sum(r * r for r in rays)) / np.abs(rays[axis]) * np.float32(spacing[axis] / cuts)
@@ -137,22 +149,26 @@ def _project(volume: Volume, view: View) -> np.ndarray:
 
 
 def _cut_across(view: View, A: np.ndarray) -> tuple[int, int, float]:
-    """The axis (x, y, z: 0, 1, 2) that all rays A (u, v, 1) of the field follow best, 1 or -1 as they do so along or against it, and the least cosine
-    of one to it, which is that of a corner. Raises ValueError where that is below FLATTEST."""
+    """The axis (x, y, z: 0, 1, 2) that all rays A (u, v, 1) of the field follow best, 1 or -1 as they do so along or
+    against it, and the least cosine of one to it, which is that of a corner. Raises ValueError where that is below
+    FLATTEST."""
     right, bottom = view.width - 1, view.height - 1
     corners = A @ [[0, right, 0, right], [0, 0, bottom, bottom], [1, 1, 1, 1]]
     ahead = np.where(corners[:, 0] > 0, 1, -1)
     cosines = (ahead[:, None] * corners / np.linalg.norm(corners, axis=0)).min(axis=1)
     axis = int(cosines.argmax())
     if cosines[axis] < FLATTEST:
-        raise ValueError(f'plane {view.name}: its field is too wide for a CT: no axis of the volume is near to all of its rays')
+        raise ValueError(f'plane {view.name}: its field is too wide for a CT: '
+                         'no axis of the volume is near to all of its rays')
     return axis, int(ahead[axis]), float(cosines[axis])
 
 
 def _shadow(view: View, to_cut: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of the image that hold all that `to_cut`, a homography from pixels, takes into a cut of (h, w) voxels; may be empty."""
+    """Rows and columns of the image that hold all that `to_cut`, a homography from pixels, takes into a cut of (h, w)
+    voxels; may be empty."""
     h, w = shape[:2]
-    corners = np.linalg.inv(to_cut) @ [[-1, w, -1, w], [-1, -1, h, h], [1, 1, 1, 1]]       # the outermost voxels fade out over their width
+    # the outermost voxels fade out over their width
+    corners = np.linalg.inv(to_cut) @ [[-1, w, -1, w], [-1, -1, h, h], [1, 1, 1, 1]]
     size = [view.width, view.height]
     if corners[2].min() * corners[2].max() <= 0:
         return slice(0, size[1]), slice(0, size[0])         # some of the cut stands beside or behind the source
@@ -163,12 +179,14 @@ def _shadow(view: View, to_cut: np.ndarray, shape: tuple[int, ...]) -> tuple[sli
 
 
 def _cuts(hu: np.ndarray, number: int) -> Iterator[tuple[float, np.ndarray]]:
-    """The places, in slices, and the (h, w, 2) densities of `number` cuts through each slice of (N, h, w); linear between two slices."""
+    """The places, in slices, and the (h, w, 2) densities of `number` cuts through each slice of (N, h, w); linear
+    between two slices."""
     before = here = densities(hu[0])
     for k in range(len(hu)):
         after = densities(hu[k + 1]) if k + 1 < len(hu) else here
         for off in (np.arange(number) + 0.5) / number - 0.5:
-            yield k + off, cv2.addWeighted(here, 1 - abs(off), after if off > 0 else before, abs(off), 0) if off else here
+            yield (k + off, cv2.addWeighted(here, 1 - abs(off), after if off > 0 else before, abs(off), 0)
+                            if off else here)
         before, here = here, after
 
 
@@ -176,7 +194,8 @@ def _cuts(hu: np.ndarray, number: int) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def draw_placement(rng: np.random.Generator, volume: Volume) -> Placement:
-    """A patient turned by up to TURN about each axis, with a point deep inside the body at the isocentre. Raises CtError where there is no body."""
+    """A patient turned by up to TURN about each axis, with a point deep inside the body at the isocentre. Raises
+    CtError where there is no body."""
     places, below = _body(volume)
     deep = np.flatnonzero(below >= min(INSIDE, INSIDE_SHARE * below.max()))
     rotation = Rotation.from_euler('xyz', rng.uniform(-TURN, TURN, 3)).as_matrix()
@@ -184,7 +203,8 @@ def draw_placement(rng: np.random.Generator, volume: Volume) -> Placement:
 
 
 def _body(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) points x, y, z in m that lie in the body, what it encloses too, and their (N,) depths in m below its surface or where the CT ends.
+    """(N, 3) points x, y, z in m that lie in the body, what it encloses too, and their (N,) depths in m below its
+    surface or where the CT ends.
 
     Raises CtError where there is none.
     """
@@ -204,9 +224,11 @@ def _body(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_ct(path: str | Path) -> Volume:
-    """The CT in an NPZ file (`hu` (z, y, x) in Hounsfield units, `spacing_m` (3,)) or in a folder with one DICOM series. Raises CtError.
+    """The CT in an NPZ file (`hu` (z, y, x) in Hounsfield units, `spacing_m` (3,)) or in a folder with one DICOM
+    series. Raises CtError.
 
-    The array axes of an NPZ run to the head, to the back and to the patient's left. The last CT is kept; its arrays are read-only.
+    The array axes of an NPZ run to the head, to the back and to the patient's left. The last CT is kept; its arrays are
+    read-only.
     """
     return _load(Path(path).expanduser().resolve())
 
@@ -232,7 +254,8 @@ def _checked(path: Path, hu: np.ndarray, spacing: np.ndarray) -> Volume:
         if not np.isfinite(array).all():
             raise CtError(f'{path}: {name} is not finite')
     if not ((spacing > 0) & (spacing <= LARGEST_SPACING)).all():
-        raise CtError(f'{path}: spacing_m must lie in (0, {LARGEST_SPACING:g}] m, got {", ".join(f"{s:g}" for s in spacing)}')
+        raise CtError(f'{path}: spacing_m must lie in (0, {LARGEST_SPACING:g}] m, '
+                      f'got {", ".join(f"{s:g}" for s in spacing)}')
     if hu.dtype != np.int16:
         limits = np.iinfo(np.int16)
         hu = np.rint(np.clip(hu, limits.min, limits.max)).astype(np.int16)
@@ -254,7 +277,8 @@ def _npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _dicom(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """HU (z, y, x) and spacing in m of the one CT series in a folder. Raises CtError.
 
-    PS3.3 C.7.6.2: ImageOrientationPatient tells where columns and rows count to, ImagePositionPatient where the first pixel's centre is.
+    PS3.3 C.7.6.2: ImageOrientationPatient tells where columns and rows count to, ImagePositionPatient where the first
+    pixel's centre is.
     """
     headers = _headers(folder)
     if not headers:
@@ -267,11 +291,12 @@ def _dicom(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if len(headers) < 2:
         raise CtError(f'{folder}: a single slice; a volume needs two')
     grid = (('ImageOrientationPatient', 6), ('PixelSpacing', 2), ('Rows', 1), ('Columns', 1))
-    files, grids = list(headers), np.array([[x for name, n in grid for x in _values(p, h, name, n)] for p, h in headers.items()])
+    files, grids = list(headers), np.array([[x for name, n in grid for x in _values(p, h, name, n)]
+                                            for p, h in headers.items()])
     if odd := np.flatnonzero(np.abs(grids - grids[0]).max(axis=1) > 1e-3).tolist():
         raise CtError(f'{files[odd[0]]}: its orientation, spacing or size is not that of {files[0].name}')
     towards_column, towards_row = grids[0, :3], grids[0, 3:6]
-    axes = np.stack([np.cross(towards_column, towards_row), towards_row, towards_column])       # of slices, rows and columns
+    axes = np.stack([np.cross(towards_column, towards_row), towards_row, towards_column])  # of slices, rows and columns
     along = np.abs(axes).argmax(axis=1)
     if sorted(along) != [0, 1, 2] or np.abs(axes).max(axis=1).min() < STRAIGHT:
         raise CtError(f'{folder}: its slices are oblique to the patient')

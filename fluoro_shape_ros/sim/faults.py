@@ -76,7 +76,8 @@ def draw_wire(rng: np.random.Generator, motion: Motion) -> Wire:
     aside = np.cross(curve[middle + 1] - curve[middle - 1], rng.normal(size=3))
     velocity = aside / np.linalg.norm(aside) * rng.uniform(*SPEED)
     met = points[int(len(points) * rng.uniform(*WHERE))]
-    return Wire(curve - curve[middle] + met, velocity, meets_s, Device((Segment(REST, float(rng.uniform(*RADII)), 'metal'),)))
+    return Wire(curve - curve[middle] + met, velocity, meets_s,
+                Device((Segment(REST, float(rng.uniform(*RADII)), 'metal'),)))
 
 
 def draw_bolus(rng: np.random.Generator, views: tuple[View, View]) -> Bolus:

@@ -1,7 +1,8 @@
-"""A renderer that is not ours: gVirtualXray (Vidal et al. 2009) draws a device as closed triangle meshes in a block of water.
+"""A renderer that is not ours: gVirtualXray (Vidal et al. 2009) draws a device as closed triangle meshes in a block of
+water.
 
-It knows a point source, a flat detector, meshes and their attenuation, and takes Beer-Lambert's law along each ray. So it shares nothing with `xray`
-but the View and what the device is made of.
+It knows a point source, a flat detector, meshes and their attenuation, and takes Beer-Lambert's law along each ray. So
+it shares nothing with `xray` but the View and what the device is made of.
 """
 
 from __future__ import annotations
@@ -20,16 +21,18 @@ from ..geometry.cameras import decompose
 from . import mesh
 from .carm import shadow_box
 
-# Points of a pixel at which rays are taken (u, v in px): a Fibonacci lattice, which meets an edge along either axis at 13 places
+# Points of a pixel at which rays are taken (u, v in px): a Fibonacci lattice, which meets an edge along either axis at
+# 13 places
 SAMPLES = np.stack([np.arange(13), np.arange(13) * 8 % 13], axis=1) / 13 - 6 / 13
 MARGIN = 1e-3           # m of water around the device
 MOST_SKEW_PX = 0.01     # that is taken for none
 DARKEST = np.finfo(np.float32).tiny
 
-PACKAGES = ('libegl1 libgl1-mesa-dri libgl1 libopengl0 libsm6 libxrender1 libxcb-composite0 libxcb-cursor0 libxcb-ewmh2 libxcb-icccm4 '
-            'libxcb-keysyms1 libxcb-res0 libxcb-shape0 libxcb-xinerama0 libxcb-xkb1')
+PACKAGES = ('libegl1 libgl1-mesa-dri libgl1 libopengl0 libsm6 libxrender1 libxcb-composite0 libxcb-cursor0 '
+            'libxcb-ewmh2 libxcb-icccm4 libxcb-keysyms1 libxcb-res0 libxcb-shape0 libxcb-xinerama0 libxcb-xkb1')
 
-# gVirtualXray has one OpenGL context a process, which belongs to a thread; where VTK draws in that thread too, pictures go wrong without a word
+# gVirtualXray has one OpenGL context a process, which belongs to a thread; where VTK draws in that thread too, pictures
+# go wrong without a word
 _thread = ThreadPoolExecutor(1, 'gvxr')
 
 
@@ -37,12 +40,15 @@ class NoOpenGL(OSError):
     """gVirtualXray is there, but nothing that it could draw with, or that draws as much as is asked for."""
 
 
-def optical_depth(backbone: np.ndarray, device: Device, view: View, energy_kev: float, tissue: float | None = None) -> np.ndarray:
-    """(H, W) float32: what a device about the (N, 3) backbone, base to tip, adds to the integral of attenuation along the X-rays; mean over each pixel.
+def optical_depth(backbone: np.ndarray, device: Device, view: View, energy_kev: float,
+                  tissue: float | None = None) -> np.ndarray:
+    """(H, W) float32: what a device about the (N, 3) backbone, base to tip, adds to the integral of attenuation along
+    the X-rays; mean over each pixel.
 
-    `tissue`: m, how thick a block of water it lies in; None: one that just holds it. Values end near 80, where the beam does in float32. Raises
-    ImportError where gVirtualXray or a library that it needs is missing, NoOpenGL where it can't draw, ValueError where the block doesn't hold the
-    device or reaches the source, and for pixels that are no rectangles.
+    `tissue`: m, how thick a block of water it lies in; None: one that just holds it. Values end near 80, where the beam
+    does in float32. Raises ImportError where gVirtualXray or a library that it needs is missing, NoOpenGL where it
+    can't draw, ValueError where the block doesn't hold the device or reaches the source, and for pixels that are no
+    rectangles.
     """
     image = np.zeros((view.height, view.width), np.float32)
     box = shadow_box(view, backbone, device.widest)
@@ -51,10 +57,13 @@ def optical_depth(backbone: np.ndarray, device: Device, view: View, energy_kev: 
     return image
 
 
-def transmission(backbone: np.ndarray, device: Device, view: View, energy_kev: float, tissue: float | None = None) -> np.ndarray:
-    """(H, W) float32: the share of the beam behind the block of water that the device lets through; mean over each pixel, as a detector takes it.
+def transmission(backbone: np.ndarray, device: Device, view: View, energy_kev: float,
+                 tissue: float | None = None) -> np.ndarray:
+    """(H, W) float32: the share of the beam behind the block of water that the device lets through; mean over each
+    pixel, as a detector takes it.
 
-    At sharp edges that is more than exp(-optical_depth), which is what `xray` makes of a pixel. Arguments and errors: `optical_depth`.
+    At sharp edges that is more than exp(-optical_depth), which is what `xray` makes of a pixel. Arguments and errors:
+    `optical_depth`.
     """
     image = np.ones((view.height, view.width), np.float32)
     box = shadow_box(view, backbone, device.widest)
@@ -69,12 +78,15 @@ def _within(image: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> np.ndarray
     return image[low[1]:high[1], low[0]:high[0]]
 
 
-def _beams(backbone: np.ndarray, device: Device, view: View, energy_kev: float, tissue: float | None, box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """(S, h, w) float32: the share of the beam that the device lets through at each of SAMPLES, in the pixels between two corners (u, v)."""
+def _beams(backbone: np.ndarray, device: Device, view: View, energy_kev: float, tissue: float | None,
+           box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """(S, h, w) float32: the share of the beam that the device lets through at each of SAMPLES, in the pixels between
+    two corners (u, v)."""
     K, R, t = decompose(view.P)
     skew = K[0, 1] / K[1, 1]
     if abs(skew) * view.height > MOST_SKEW_PX:
-        raise ValueError(f'plane {view.name}: gVirtualXray has rectangular pixels only, not such as are skewed by {skew:.2g}')
+        raise ValueError(f'plane {view.name}: gVirtualXray has rectangular pixels only, '
+                         f'not such as are skewed by {skew:.2g}')
     water = water_attenuation(energy_kev)
     parts = [(vertices @ R.T + t, triangles, attenuation(material, energy_kev) + water)
              for material, (vertices, triangles) in mesh.device_meshes(backbone, device).items()]
@@ -94,18 +106,21 @@ def _block(depths: np.ndarray, tissue: float | None, plane: str) -> tuple[float,
     near, far = depths.min() - MARGIN, depths.max() + MARGIN
     if tissue is not None:
         if tissue < far - near:
-            raise ValueError(f'plane {plane}: {tissue:g} m of tissue do not hold a device that reaches over {far - near:.3g} m along the beam')
+            raise ValueError(f'plane {plane}: {tissue:g} m of tissue do not hold a device that reaches over '
+                             f'{far - near:.3g} m along the beam')
         near, far = (near + far - tissue) / 2, (near + far + tissue) / 2
     if near <= 0:
         raise ValueError(f'plane {plane}: the tissue around the device reaches the X-ray source')
     return near, far
 
 
-def _draw(block: tuple, parts: list[tuple], detectors: np.ndarray, pitch: np.ndarray, size: np.ndarray, energy_kev: float) -> np.ndarray:
-    """(S, h, w) float32 in (0, 1]: the beam behind block and device over that behind the block alone, with the detector's middle at (S, 3) points in m.
+def _draw(block: tuple, parts: list[tuple], detectors: np.ndarray, pitch: np.ndarray, size: np.ndarray,
+          energy_kev: float) -> np.ndarray:
+    """(S, h, w) float32 in (0, 1]: the beam behind block and device over that behind the block alone, with the
+    detector's middle at (S, 3) points in m.
 
-    `block` and each of `parts` are vertices in m, triangles and attenuation in 1/m; `size` is (w, h) in px of `pitch` (2,) m. All stands in the
-    camera's frame: the source at 0, u along x, v along y, the beam along z.
+    `block` and each of `parts` are vertices in m, triangles and attenuation in 1/m; `size` is (w, h) in px of `pitch`
+    (2,) m. All stands in the camera's frame: the source at 0, u along x, v along y, the beam along z.
     """
     gvxr = _gvxr()
     origin = np.concatenate([vertices for vertices, _, _ in parts]).mean(axis=0)    # float32 is finest there
@@ -114,7 +129,8 @@ def _draw(block: tuple, parts: list[tuple], detectors: np.ndarray, pitch: np.nda
         return 1e3 * (points - origin)
 
     def add(name: str, vertices: np.ndarray, triangles: np.ndarray, mu: float) -> None:
-        gvxr.makeTriangularMesh(name, mm(vertices).astype(np.float32).ravel(), triangles.astype(np.uint32).ravel(), 'mm')
+        gvxr.makeTriangularMesh(name, mm(vertices).astype(np.float32).ravel(),
+                                triangles.astype(np.uint32).ravel(), 'mm')
         gvxr.setLinearAttenuationCoefficient(name, float(mu / 100), 'cm-1')
 
     def picture(detector: np.ndarray) -> np.ndarray:
@@ -131,7 +147,8 @@ def _draw(block: tuple, parts: list[tuple], detectors: np.ndarray, pitch: np.nda
         gvxr.setDetectorNumberOfPixels(*size.tolist())
         gvxr.setDetectorPixelSize(*(1e3 * pitch).tolist(), 'mm')
         add('block', *block)
-        # where there are no inner surfaces, what those of the last scene took out of an outer one stays out: alone, the block is an inner one too
+        # where there are no inner surfaces, what those of the last scene took out of an outer one stays out: alone, the
+        # block is an inner one too
         gvxr.addPolygonMeshAsInnerSurface('block')
         alone = picture(detectors.mean(axis=0))
         gvxr.removePolygonMeshesFromXRayRenderer()
@@ -150,14 +167,15 @@ def _gvxr():
     try:
         from gvxrPython3 import gvxr
     except ImportError as error:
-        raise ImportError(f'the gVirtualXray renderer can not be loaded here ({error}): pip install "fluoro_shape_ros[gvxr]", '
-                          f'and on Debian or Ubuntu apt install {PACKAGES}') from error
+        raise ImportError(f'the gVirtualXray renderer can not be loaded here ({error}): pip install '
+                          f'"fluoro_shape_ros[gvxr]", and on Debian or Ubuntu apt install {PACKAGES}') from error
     gvxr.useLogFile(os.devnull)
     try:
         with _silent():
             gvxr.createWindow(-1, False, 'EGL')
     except RuntimeError as error:
-        raise NoOpenGL(f'gVirtualXray finds no OpenGL: it needs libEGL with a (software) driver ({_first_line(error)})') from error
+        raise NoOpenGL('gVirtualXray finds no OpenGL: it needs libEGL with a (software) driver '
+                       f'({_first_line(error)})') from error
     gvxr.disableArtefactFiltering()
     gvxr.usePointSource()
     return gvxr

@@ -2,12 +2,15 @@
 
 A sharp beam I (H, W), the share of the X-rays that pass without being scattered, becomes
 
-    D = G(blur) I + share / (1 - share) G(scatter) I                 detected, in units of its median over the field without a device
-    N = D + sqrt(D / photons) n                                      n: unit normal, correlated over `noise_px`
-    V = (c(N) - black) / (white - black)                             c: the display's curve, linear, a power, or a logarithm
-    V + sharpening (V - G(sharpening_px) V), in 2^bits - 1 steps     an unsharp mask
+    D = G(blur) I + share / (1 - share) G(scatter) I                detected, in units of its median over the field
+                                                                    without a device
+    N = D + sqrt(D / photons) n                                     n: unit normal, correlated over `noise_px`
+    V = (c(N) - black) / (white - black)                            c: the display's curve, linear, a power, or a
+                                                                    logarithm
+    V + sharpening (V - G(sharpening_px) V), in 2^bits - 1 steps    an unsharp mask
 
-G(s) is convolution with a Gaussian of s px. Exposure and window belong to a run: they are set once, by what a plane shows without a device.
+G(s) is convolution with a Gaussian of s px. Exposure and window belong to a run: they are set once, by what a plane
+shows without a device.
 """
 
 from __future__ import annotations
@@ -38,9 +41,11 @@ class Imaging:
     scatter: float = _q(0.3, 'share of what is detected that was scattered', '', 0.05, 0.6)
     scatter_px: float = _q(90.0, 'how far scatter spreads, sigma', 'px', 40, 200)
     blur_px: float = _q(0.9, 'focal spot and detector, sigma', 'px', 0.4, 2.0)
-    noise_px: float = _q(0.4, 'kernel that noise is correlated by, sigma; 0.3 to 0.6 make it 1 to 2 px wide', 'px', 0.0, 0.7)
+    noise_px: float = _q(0.4, 'kernel that noise is correlated by, sigma; 0.3 to 0.6 make it 1 to 2 px wide',
+                         'px', 0.0, 0.7)
     gamma: float = _q(1.0, 'power of the display gamma', '', 0.45, 2.2, log=True)
-    black: float = _q(0.0, 'of the window beyond the darkest 1 %, in widths of the field\'s range; above 0 it is cut off', '', -0.8, 0.02)
+    black: float = _q(0.0, 'of the window beyond the darkest 1 %, in widths of the field\'s range; '
+                           'above 0 it is cut off', '', -0.8, 0.02)
     white: float = _q(0.0, 'the same beyond the brightest 1 %', '', -0.02, 0.5)
     sharpening: float = _q(0.0, 'strength of the unsharp mask', '', 0.0, 1.2)
     sharpening_px: float = _q(2.5, 'its sigma', 'px', 1.5, 6.0)
@@ -51,7 +56,8 @@ class Imaging:
     def __post_init__(self):
         if self.display not in DISPLAYS:
             raise ValueError(f'no display is called {self.display!r}: there are {", ".join(DISPLAYS)}')
-        if not (1 <= self.bits <= 16 and self.photons > 0 and 0 <= self.scatter < 1 and 0 <= self.lag < 1 and self.gamma > 0 and self.white - self.black > -0.9
+        if not (1 <= self.bits <= 16 and self.photons > 0 and 0 <= self.scatter < 1 and 0 <= self.lag < 1
+                and self.gamma > 0 and self.white - self.black > -0.9
                 and min(self.blur_px, self.noise_px, self.scatter_px, self.sharpening, self.sharpening_px) >= 0):
             raise ValueError(f'no imaging: {self}')
 
@@ -66,30 +72,34 @@ class Levels:
 
 
 SETTINGS = {
-    'fluoroscopy': Imaging(energy_kev=68, photons=250, scatter=0.35, blur_px=0.9, noise_px=0.45, display='logarithmic', black=-0.2, white=0.1,
-                           sharpening=0.4, lag=0.3),
-    'cine': Imaging(energy_kev=75, photons=2000, scatter=0.3, blur_px=0.7, noise_px=0.3, display='gamma', gamma=0.7, black=-0.1, white=0.05, sharpening=0.6,
-                    sharpening_px=2.0, bits=10),
-    'intensifier': Imaging(energy_kev=60, photons=400, scatter=0.4, scatter_px=140, blur_px=1.6, noise_px=0.5, display='linear', black=-0.4, white=0.2, lag=0.2),
+    'fluoroscopy': Imaging(energy_kev=68, photons=250, scatter=0.35, blur_px=0.9, noise_px=0.45, display='logarithmic',
+                           black=-0.2, white=0.1, sharpening=0.4, lag=0.3),
+    'cine': Imaging(energy_kev=75, photons=2000, scatter=0.3, blur_px=0.7, noise_px=0.3, display='gamma', gamma=0.7,
+                    black=-0.1, white=0.05, sharpening=0.6, sharpening_px=2.0, bits=10),
+    'intensifier': Imaging(energy_kev=60, photons=400, scatter=0.4, scatter_px=140, blur_px=1.6, noise_px=0.5,
+                           display='linear', black=-0.4, white=0.2, lag=0.2),
 }
 CIRCULAR = ('intensifier',)     # settings whose field is a circle
 
 
 def draw(rng: np.random.Generator) -> Imaging:
-    """An imaging chain with every quantity drawn from its range; a third of the displays sharpen nothing, a third average nothing."""
+    """An imaging chain with every quantity drawn from its range; a third of the displays sharpen nothing, a third
+    average nothing."""
     values = {}
     for f in dataclasses.fields(Imaging):
         if f.metadata:
             low, high = f.metadata['low'], f.metadata['high']
-            values[f.name] = float(np.exp(rng.uniform(np.log(low), np.log(high))) if f.metadata['log'] else rng.uniform(low, high))
+            values[f.name] = float(np.exp(rng.uniform(np.log(low), np.log(high)))
+                                   if f.metadata['log'] else rng.uniform(low, high))
     for name in ('sharpening', 'lag'):
         values[name] *= bool(rng.random() > 1 / 3)
     return Imaging(**values, display=str(rng.choice(DISPLAYS)), bits=int(rng.choice([8, 10, 12, 16])))
 
 
 def levels(bare: np.ndarray, imaging: Imaging, aperture: np.ndarray | None = None) -> Levels:
-    """Exposure and window for the (H, W) sharp beam without a device, by the middle half of the image as automatic exposure has it, where the
-    `aperture` of blades or intensifier, the (H, W) share of the beam that it lets through, is open."""
+    """Exposure and window for the (H, W) sharp beam without a device, by the middle half of the image as automatic
+    exposure has it, where the `aperture` of blades or intensifier, the (H, W) share of the beam that it lets through,
+    is open."""
     h, w = bare.shape
     middle = slice(h // 4, h - h // 4), slice(w // 4, w - w // 4)
     detected = spread(bare, imaging)[middle]
@@ -103,13 +113,16 @@ def levels(bare: np.ndarray, imaging: Imaging, aperture: np.ndarray | None = Non
 def spread(beam: np.ndarray, imaging: Imaging) -> np.ndarray:
     """(H, W) float32: the beam as it is detected, blurred and with scatter, without noise. It is linear in the beam."""
     size = beam.shape[1] // COARSE + 1, beam.shape[0] // COARSE + 1
-    coarse = cv2.GaussianBlur(cv2.resize(beam, size, interpolation=cv2.INTER_AREA), (0, 0), max(imaging.scatter_px / COARSE, 0.5))
-    scattered = cv2.resize(coarse, beam.shape[::-1], interpolation=cv2.INTER_CUBIC) * np.float32(imaging.scatter / (1 - imaging.scatter))
+    coarse = cv2.GaussianBlur(cv2.resize(beam, size, interpolation=cv2.INTER_AREA), (0, 0),
+                              max(imaging.scatter_px / COARSE, 0.5))
+    scattered = (cv2.resize(coarse, beam.shape[::-1], interpolation=cv2.INTER_CUBIC)
+                 * np.float32(imaging.scatter / (1 - imaging.scatter)))
     return (cv2.GaussianBlur(beam, (0, 0), imaging.blur_px) if imaging.blur_px > 0 else beam) + scattered
 
 
 def detect(beam: np.ndarray, imaging: Imaging, exposure: Levels, rng: np.random.Generator | None) -> np.ndarray:
-    """(H, W) float32: what is detected of a sharp (H, W) beam, 1 at the field's median; with quantum noise, or without for rng None."""
+    """(H, W) float32: what is detected of a sharp (H, W) beam, 1 at the field's median; with quantum noise, or without
+    for rng None."""
     detected = np.maximum(spread(beam, imaging), 0) / np.float32(exposure.median)
     if rng is None:
         return detected

@@ -1,6 +1,8 @@
-"""Continuum robots that joints move: concentric tubes and a tendon-driven segment, both chains of arcs, and what a load at the tip does to them.
+"""Continuum robots that joints move: concentric tubes and a tendon-driven segment, both chains of arcs, and what a load
+at the tip does to them.
 
-Joint values q are an (n,) array in the order of `joints`, m and rad. In a robot's own frame it leaves its base at the origin along +x.
+Joint values q are an (n,) array in the order of `joints`, m and rad. In a robot's own frame it leaves its base at the
+origin along +x.
 """
 
 from __future__ import annotations
@@ -41,8 +43,9 @@ class Tube:
 class TubeRobot:
     """Concentric tubes, the outermost first; torsionally rigid, without friction, in sections of constant curvature.
 
-    R. J. Webster III, J. M. Romano, N. J. Cowan, Mechanics of Precurved-Tube Continuum Robots, IEEE Transactions on Robotics 25(1), 2009. q: how far
-    each tube reaches beyond the one around it (the first: beyond the base), m, then the rotation of each about the base tangent, rad.
+    R. J. Webster III, J. M. Romano, N. J. Cowan, Mechanics of Precurved-Tube Continuum Robots, IEEE Transactions on
+    Robotics 25(1), 2009. q: how far each tube reaches beyond the one around it (the first: beyond the base), m, then
+    the rotation of each about the base tangent, rad.
     """
 
     tubes: tuple[Tube, ...]
@@ -54,7 +57,8 @@ class TubeRobot:
         return reach + tuple(Joint(f'rotation_{k + 1}', -2 * np.pi, 2 * np.pi, 1.0) for k in range(len(self.tubes)))
 
     def sections(self, q: np.ndarray) -> list[Section]:
-        """Pieces between the places where a tube ends or begins to be curved; in each the bending moments of its tubes balance."""
+        """Pieces between the places where a tube ends or begins to be curved; in each the bending moments of its tubes
+        balance."""
         n = len(self.tubes)
         ends, rotation = np.cumsum(q[:n]), q[n:]
         begins = np.maximum(ends - [tube.curved for tube in self.tubes], 0.0)
@@ -72,7 +76,8 @@ class TubeRobot:
         return self.pose.apply(chain(self.sections(np.asarray(q, float)), step))
 
     def misjudged(self, share: float) -> TubeRobot:
-        """A robot whose tubes are more curved by `share`, and whose outermost one is that much less stiff, than this one's."""
+        """A robot whose tubes are more curved by `share`, and whose outermost one is that much less stiff, than this
+        one's."""
         tubes = [dataclasses.replace(tube, curvature=tube.curvature * (1 + share)) for tube in self.tubes]
         tubes[0] = dataclasses.replace(tubes[0], stiffness=tubes[0].stiffness * (1 - share))
         return dataclasses.replace(self, tubes=tuple(tubes))
@@ -82,9 +87,9 @@ class TubeRobot:
 class TendonRobot:
     """A stiff shaft that carries a segment which two pairs of antagonistic tendons bend to a circular arc.
 
-    R. J. Webster III, B. A. Jones, Design and Kinematic Modeling of Constant Curvature Continuum Robots: A Review, IJRR 29(13), 2010: a tendon at
-    distance d from the axis, pulled by p in the bending plane, turns the tip by p / d. q: reach of the shaft (m), its rotation (rad), pull of
-    each pair (m).
+    R. J. Webster III, B. A. Jones, Design and Kinematic Modeling of Constant Curvature Continuum Robots: A Review, IJRR
+    29(13), 2010: a tendon at distance d from the axis, pulled by p in the bending plane, turns the tip by p / d.
+    q: reach of the shaft (m), its rotation (rad), pull of each pair (m).
     """
 
     length: float       # m, of the segment
@@ -121,12 +126,14 @@ def jacobian(robot: TubeRobot | TendonRobot, q: np.ndarray) -> np.ndarray:
 
 
 def reaching(robot: TubeRobot | TendonRobot, tip: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """(n,) joint values, found from q on, at which a robot's tip is as near as it gets to (3,) `tip`, m: damped least squares within the limits."""
+    """(n,) joint values, found from q on, at which a robot's tip is as near as it gets to (3,) `tip`, m: damped least
+    squares within the limits."""
     speed = np.array([joint.speed for joint in robot.joints])
     for _ in range(60):
         error = tip - robot.backbone(q, COARSE)[-1]
         J = jacobian(robot, q) * speed
-        step = speed * (J.T @ np.linalg.solve(J @ J.T + 0.001**2 * np.eye(3), error * min(1.0, 0.005 / max(float(np.linalg.norm(error)), 1e-9))))
+        step = speed * (J.T @ np.linalg.solve(J @ J.T + 0.001**2 * np.eye(3),
+                                              error * min(1.0, 0.005 / max(float(np.linalg.norm(error)), 1e-9))))
         q = limited(robot.joints, q + step)
     return q
 
@@ -137,7 +144,8 @@ def limited(joints: Sequence[Joint], q: np.ndarray) -> np.ndarray:
 
 
 def driven(joints: Sequence[Joint], q: np.ndarray, command: np.ndarray, seconds: float) -> np.ndarray:
-    """(n,) where joints at `q` are `seconds` after a `command`: no joint moves faster than it can, or beyond its limits."""
+    """(n,) where joints at `q` are `seconds` after a `command`: no joint moves faster than it can, or beyond its
+    limits."""
     reach = np.array([joint.speed for joint in joints]) * seconds
     return q + np.clip(limited(joints, command) - q, -reach, reach)
 
@@ -145,8 +153,9 @@ def driven(joints: Sequence[Joint], q: np.ndarray, command: np.ndarray, seconds:
 def loaded(points: np.ndarray, load: np.ndarray) -> np.ndarray:
     """(N, 3) the backbone (N, 3) bent by a force at its tip: smooth, and no longer or shorter than before.
 
-    load: (3,) force over bending stiffness, 1/m^2, in the reference frame. Kirchhoff's rod to first order: the moment (tip - x) x F of the unloaded
-    shape turns the tangents; the tip of a straight rod of length L goes aside by F L^3 / (3 E I).
+    load: (3,) force over bending stiffness, 1/m^2, in the reference frame. Kirchhoff's rod to first order: the moment
+    (tip - x) x F of the unloaded shape turns the tangents; the tip of a straight rod of length L goes aside by F L^3 /
+    (3 E I).
     """
     steps = np.diff(points, axis=0)
     s = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=1)))

@@ -1,7 +1,8 @@
 """A device as closed triangle meshes, for renderers that draw surfaces.
 
-Each piece of a device is one closed surface: a tube about the backbone with flat ends, whose triangles run anticlockwise as seen from outside the
-material. Where it has a lumen, an inner wall is turned inside out and rings close the ends.
+Each piece of a device is one closed surface: a tube about the backbone with flat ends, whose triangles run
+anticlockwise as seen from outside the material. Where it has a lumen, an inner wall is turned inside out and rings
+close the ends.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from ..geometry.curve import arc_length, frames
 
 SIDES = 64      # of a tube; its cross-section has the circle's area, its width is off by at most 0.08 %
 SAG = 5e-7      # m: how far the chords of a bend may lie inside it
-LONGEST = 1e-3  # m, of a triangle; some renderers interpolate distance from the source between vertices, which is off by length^2 / (8 distance)
+LONGEST = 1e-3  # m, of a triangle; some renderers interpolate distance from the source between vertices, which is off
+                # by length^2 / (8 distance)
 
 
 def device_meshes(backbone: np.ndarray, device: Device) -> dict[str | float, tuple[np.ndarray, np.ndarray]]:
-    """(V, 3) vertices in m and (T, 3) triangles of all that is of one material, for each in a device about the (N, 3) backbone, base to tip."""
+    """(V, 3) vertices in m and (T, 3) triangles of all that is of one material, for each in a device about the (N, 3)
+    backbone, base to tip."""
     s = arc_length(backbone)
     axis = np.concatenate([backbone, *frames(backbone)], axis=1)
     bend = np.linalg.norm(np.gradient(axis[:, 3:6], s, axis=0), axis=1).max()
@@ -31,19 +34,22 @@ def device_meshes(backbone: np.ndarray, device: Device) -> dict[str | float, tup
 
 
 def tube(axis: np.ndarray, at: np.ndarray, radius: float, lumen: float) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 3) vertices in m and (T, 3) triangles of a tube of `radius` m, hollow where `lumen` (m, radius) is not 0, through (M,) arc lengths in m.
+    """(V, 3) vertices in m and (T, 3) triangles of a tube of `radius` m, hollow where `lumen` (m, radius) is not 0,
+    through (M,) arc lengths in m.
 
     `axis` is (N, 9): points of the backbone, tangents and normals.
     """
     s = arc_length(axis[:, :3])
-    centres, tangents, normals = np.stack([np.interp(at, s, c) for c in axis.T], axis=1).reshape(-1, 3, 3).swapaxes(0, 1)
+    centres, tangents, normals = np.stack([np.interp(at, s, c) for c in axis.T],
+                                          axis=1).reshape(-1, 3, 3).swapaxes(0, 1)
     sideways = np.cross(tangents, normals)
     sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
     upwards = np.cross(sideways, tangents)
     upwards /= np.linalg.norm(upwards, axis=1, keepdims=True)
     turn = 2 * np.pi / SIDES * np.arange(SIDES)
     # a polygon of the circle's area
-    ring = np.sqrt(turn[1] / np.sin(turn[1])) * (np.cos(turn)[:, None] * upwards[:, None] + np.sin(turn)[:, None] * sideways[:, None])
+    ring = np.sqrt(turn[1] / np.sin(turn[1])) * (np.cos(turn)[:, None] * upwards[:, None]
+                                                 + np.sin(turn)[:, None] * sideways[:, None])
     outer, inner = ((centres[:, None] + r * ring).reshape(-1, 3) for r in (radius, lumen))
     n, wall = len(outer), _wall(len(at))
     j, k = _around()
@@ -58,14 +64,16 @@ def tube(axis: np.ndarray, at: np.ndarray, radius: float, lumen: float) -> tuple
 def box(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(8, 3) vertices and (12, 3) triangles of the box between two corners."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    sides = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    sides = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
+             [0, 6, 4], [1, 5, 7], [1, 7, 3]]
     return low + corners * (high - low), np.array(sides)
 
 
 def together(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Meshes as one: their vertices and triangles one after another."""
     first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    return np.concatenate([v for v, _ in parts]), np.concatenate([n + triangles for n, (_, triangles) in zip(first, parts)])
+    return (np.concatenate([v for v, _ in parts]),
+            np.concatenate([n + triangles for n, (_, triangles) in zip(first, parts)]))
 
 
 def _wall(rings: int) -> np.ndarray:

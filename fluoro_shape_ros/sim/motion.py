@@ -1,4 +1,5 @@
-"""How a device moves in a stream: round after round it advances and withdraws once, bends twice, and a load pushes its tip to and fro three times."""
+"""How a device moves in a stream: round after round it advances and withdraws once, bends twice, and a load pushes its
+tip to and fro three times."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ class Motion:
         """(N, 3) m, base to tip, at `t` s, without a shaft."""
         turn = 2 * np.pi * self.rounds * t
         slide, bend = ((1 - np.cos(n * turn + phase)) / 2 for n, phase in zip((1, 2), self.phases))
-        return loaded(shapes.posed(self.shape, slide, bend).backbone(step), self.load * np.sin(3 * turn + self.phases[2]))
+        return loaded(shapes.posed(self.shape, slide, bend).backbone(step),
+                      self.load * np.sin(3 * turn + self.phases[2]))
 
     def one_round(self, moments: int) -> list[np.ndarray]:
         """So many coarse backbones, evenly in time."""
@@ -47,7 +49,8 @@ def draw(rng: np.random.Generator, shape: shapes.Spline | shapes.Cannula) -> Mot
 
 
 def paced(rng: np.random.Generator, motion: Motion, rate: float) -> Motion:
-    """The same motion, so fast that its tip, where it is fastest, goes a drawn share of STEP_M in a pair at `rate` pairs a second."""
+    """The same motion, so fast that its tip, where it is fastest, goes a drawn share of STEP_M in a pair at `rate`
+    pairs a second."""
     tips = np.array([points[-1] for points in motion.one_round(MOMENTS)])
     longest = np.linalg.norm(np.roll(tips, -1, axis=0) - tips, axis=1).max() * MOMENTS      # m a round
     return dataclasses.replace(motion, rounds=float(rng.uniform(*PEAK)) * STEP_M * rate / longest)
@@ -56,5 +59,6 @@ def paced(rng: np.random.Generator, motion: Motion, rate: float) -> Motion:
 def stays_inside(motion: Motion, fields: tuple[placement.Field, placement.Field]) -> bool:
     """Whether both fields hold all of the motion, and see the depth of the device throughout."""
     views = tuple(f.view for f in fields)
-    return all(min(f.room(points).min() for f in fields) >= ROOM_PX and placement.well_seen(points, views, placement.HARD_EPIPOLAR_SHARE)
+    return all(min(f.room(points).min() for f in fields) >= ROOM_PX
+               and placement.well_seen(points, views, placement.HARD_EPIPOLAR_SHARE)
                for points in motion.one_round(LOOKS))

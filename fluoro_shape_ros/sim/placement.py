@@ -37,22 +37,26 @@ class Field:
         edge = np.minimum(np.minimum(u, self.view.width - 1 - u), np.minimum(v, self.view.height - 1 - v)) + 0.5
         if self.room_px is None:
             return edge
-        lit = self.room_px[np.clip(np.rint(v), 0, self.view.height - 1).astype(int), np.clip(np.rint(u), 0, self.view.width - 1).astype(int)]
+        lit = self.room_px[np.clip(np.rint(v), 0, self.view.height - 1).astype(int),
+                           np.clip(np.rint(u), 0, self.view.width - 1).astype(int)]
         return np.where(edge > 0, np.minimum(edge, lit - 0.5), edge)
 
 
 def lit_field(view: View, aperture: np.ndarray | None) -> Field:
-    """The field of a view behind an `aperture` (H, W), the share of the beam that blades and intensifier let through."""
+    """The field of a view behind an `aperture` (H, W), the share of the beam that blades and intensifier let
+    through."""
     if aperture is None:
         return Field(view)
     return Field(view, cv2.distanceTransform((aperture > 0.5).astype(np.uint8), cv2.DIST_L2, 5))
 
 
-def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, lengths: tuple[float, float], entering: bool) -> tuple:
-    """A random shape that two fields see well, and the length in m of the straight shaft behind it (0 unless `entering`).
+def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, lengths: tuple[float, float],
+          entering: bool) -> tuple:
+    """A random shape that two fields see well, and the length in m of the straight shaft behind it (0 unless
+    `entering`).
 
-    Draws until the shape suits its kind, stands MARGIN_PX inside both fields wherever it moves, and, when `entering`, until its shaft leaves both.
-    Raises ValueError where no such shape turns up.
+    Draws until the shape suits its kind, stands MARGIN_PX inside both fields wherever it moves, and, when `entering`,
+    until its shaft leaves both. Raises ValueError where no such shape turns up.
     """
     if kind not in KINDS:
         raise ValueError(f'no shape is called {kind!r}: there are {", ".join(KINDS)}')
@@ -67,7 +71,8 @@ def place(rng: np.random.Generator, fields: tuple[Field, Field], kind: str, leng
         shaft = _shaft_to_border(shape, fields)
         if shaft and suits(seen_in_both(with_shaft(shape.backbone(2e-3), shaft), fields), views):
             return shape, shaft
-    raise ValueError(f'no {kind} of {lengths[0] * 1000:g} to {lengths[1] * 1000:g} mm fits well into both fields ({ATTEMPTS} tried)')
+    raise ValueError(f'no {kind} of {lengths[0] * 1000:g} to {lengths[1] * 1000:g} mm fits well into both fields '
+                     f'({ATTEMPTS} tried)')
 
 
 def well_seen(points: np.ndarray, views: tuple[View, View], share: float = MIN_EPIPOLAR_SHARE) -> bool:
@@ -84,8 +89,8 @@ def well_seen(points: np.ndarray, views: tuple[View, View], share: float = MIN_E
 
 
 def turns_back(points: np.ndarray, views: tuple[View, View]) -> bool:
-    """Whether (N, 3) points, else seen well enough, turn back in the pencil of epipolar planes: there both images are tangent to
-    their epipolar lines, and beside it the lines meet the device twice."""
+    """Whether (N, 3) points, else seen well enough, turn back in the pencil of epipolar planes: there both images are
+    tangent to their epipolar lines, and beside it the lines meet the device twice."""
     rising = _across(points, *views) > 0
     aside = _clear_steps(points)
     steady = [len(set(rising[k:k + aside])) == 1 for k in range(len(rising) - aside + 1)]
@@ -96,7 +101,8 @@ def turns_back(points: np.ndarray, views: tuple[View, View]) -> bool:
 def crosses_itself(points: np.ndarray, views: tuple[View, View]) -> bool:
     """Whether (N, 3) points, else seen well enough, cross themselves in either image, not near an end."""
     aside = _clear_steps(points)
-    return any(_crosses(project(v.P, points[aside:-aside])) for v in views) and well_seen(points, views, HARD_EPIPOLAR_SHARE)
+    return (any(_crosses(project(v.P, points[aside:-aside])) for v in views)
+            and well_seen(points, views, HARD_EPIPOLAR_SHARE))
 
 
 def _across(points: np.ndarray, view: View, other: View) -> np.ndarray:
@@ -117,7 +123,8 @@ def _crosses(uv: np.ndarray) -> bool:
     cross = d[:, None, 0] * d[None, :, 1] - d[:, None, 1] * d[None, :, 0]
     gap = a[None] - a[:, None]
     with np.errstate(divide='ignore', invalid='ignore'):
-        t = (gap[..., 0] * d[None, :, 1] - gap[..., 1] * d[None, :, 0]) / cross     # along the row's segment; along the column's: its transpose
+        # along the row's segment; along the column's: its transpose
+        t = (gap[..., 0] * d[None, :, 1] - gap[..., 1] * d[None, :, 0]) / cross
     return bool(np.triu((t >= 0) & (t <= 1) & (t.T >= 0) & (t.T <= 1), 2).any())
 
 
@@ -135,7 +142,8 @@ def _bent(rng: np.random.Generator, length: float, views) -> shapes.Spline:
 
 
 def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
-    """A loose turn of a screw, as a catheter loops, with its axis near one of the viewing directions; it bends as tight as other shapes do."""
+    """A loose turn of a screw, as a catheter loops, with its axis near one of the viewing directions; it bends as tight
+    as other shapes do."""
     knots = np.arange(max(4, int(np.ceil(length / shapes.KNOT_SPACING)) + 1))
     pitch = rng.uniform(0.4, 0.7) + rng.normal(0, 0.05, len(knots))
     yaw = shapes.MAX_CURVATURE * shapes.KNOT_SPACING * knots + rng.normal(0, 0.05, len(knots))
@@ -145,7 +153,8 @@ def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
     loop = shapes.centred(rng, shapes.Spline(length, np.c_[yaw * shapes.MAX_CURVATURE / tightest, pitch]))
     axis, beam = loop.pose.heading[:, 2], views[rng.integers(2)].P[2, :3] + rng.normal(0, 0.3, 3)
     about = np.cross(axis, beam)
-    turn = Rotation.from_rotvec(about / np.linalg.norm(about) * np.arctan2(np.linalg.norm(about), axis @ beam)).as_matrix()
+    turn = Rotation.from_rotvec(about / np.linalg.norm(about)
+                                * np.arctan2(np.linalg.norm(about), axis @ beam)).as_matrix()
     return dataclasses.replace(loop, pose=shapes.Pose(turn @ loop.pose.base, turn @ loop.pose.heading))
 
 
@@ -179,11 +188,13 @@ def _stays_inside(shape, fields: tuple[Field, Field]) -> bool:
 
 
 def _shaft_to_border(shape, fields: tuple[Field, Field]) -> float:
-    """m of straight shaft that lead from the base out of both images; 0 where LONGEST_SHAFT does not, or comes near a source."""
+    """m of straight shaft that lead from the base out of both images; 0 where LONGEST_SHAFT does not, or comes near a
+    source."""
     line = with_shaft(shape.backbone(1e-3)[:2], LONGEST_SHAFT)
     if min((line @ f.view.P[2, :3] + f.view.P[2, 3]).min() for f in fields) < 0.1:
         return 0.0
     outside = [project(f.view.P, line) for f in fields]
-    beyond = [((uv < -MARGIN_PX) | (uv > [f.view.width + MARGIN_PX, f.view.height + MARGIN_PX])).any(axis=1) for uv, f in zip(outside, fields)]
+    beyond = [((uv < -MARGIN_PX) | (uv > [f.view.width + MARGIN_PX, f.view.height + MARGIN_PX])).any(axis=1)
+              for uv, f in zip(outside, fields)]
     both = np.flatnonzero(beyond[0] & beyond[1])
     return float(np.linalg.norm(line[both[-1]] - line[-2])) if len(both) else 0.0

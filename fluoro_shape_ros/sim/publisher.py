@@ -44,16 +44,18 @@ class RosArgumentsError(ValueError):
 class FluoroSim:
     """A simulated biplane system on real topics, as a context manager with a ROS context of its own.
 
-    Given `scenes`, it publishes them in the background, `rate` pairs a second, until they end or the block is left; without, it waits for
-    `publish` or `stream`. Images and camera infos have the QoS `reliability`; ground truth is in `reference_frame` (None: the scene's).
-    Raises RosArgumentsError where `ros_arguments` (`--ros-args -r ...`) can't be used.
+    Given `scenes`, it publishes them in the background, `rate` pairs a second, until they end or the block is left;
+    without, it waits for `publish` or `stream`. Images and camera infos have the QoS `reliability`; ground truth is in
+    `reference_frame` (None: the scene's). Raises RosArgumentsError where `ros_arguments` (`--ros-args -r ...`) can't be
+    used.
     """
 
     def __init__(self, scenes: Iterable[Scene] | None = None, *, rate: float = 15.0, reliability: str = 'reliable',
                  reference_frame: str | None = None, ros_arguments: Sequence[str] = ()):
         self.published = 0      # pairs
         self._scenes, self._rate = scenes, rate
-        self._reliability, self._reference_frame, self._arguments = RELIABILITIES[reliability], reference_frame, list(ros_arguments)
+        self._reliability, self._reference_frame, self._arguments = (RELIABILITIES[reliability], reference_frame,
+                                                                     list(ros_arguments))
         self._stop = threading.Event()
         self._streaming: Future | None = None
 
@@ -61,8 +63,10 @@ class FluoroSim:
         self._context = Context()
         try:
             rclpy.init(args=self._arguments, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        except (UnknownROSArgsError, RuntimeError) as error:    # rclpy has no type of its own for arguments that it can't parse
-            raise RosArgumentsError(re.sub(r',? at \S+:\d+', '', f'ROS arguments: {error}')) from error     # without places in ROS's sources
+        except (UnknownROSArgsError, RuntimeError) as error:
+            # rclpy has no type of its own for arguments that it can't parse
+            # without places in ROS's sources
+            raise RosArgumentsError(re.sub(r',? at \S+:\d+', '', f'ROS arguments: {error}')) from error
         self._node = rclpy.create_node('fluoro_shape_sim', context=self._context, start_parameter_services=False)
         images, truth = QoSProfile(depth=5, reliability=self._reliability), QoSProfile(depth=10)
         self._images = [self._node.create_publisher(Image, f'plane_{p}/image_raw', images) for p in PLANES]
@@ -90,14 +94,16 @@ class FluoroSim:
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
             self.publish(scene)
-            due = max(due + 1 / rate, time.monotonic() - 1 / rate)      # one late pair may be caught up with, a burst may not
+            # one late pair may be caught up with, a burst may not
+            due = max(due + 1 / rate, time.monotonic() - 1 / rate)
 
     def stop(self) -> None:
         """End the stream; may be called from a signal handler."""
         self._stop.set()
 
     def publish(self, scene: Scene | Frame, stamp_ns: int | None = None) -> int:
-        """Publish a scene, or a frame without truth, and return its stamp in ns: the one given, or the node clock's now."""
+        """Publish a scene, or a frame without truth, and return its stamp in ns: the one given, or the node clock's
+        now."""
         frame = scene.frame if isinstance(scene, Scene) else scene
         stamp_ns = self._node.get_clock().now().nanoseconds if stamp_ns is None else stamp_ns
         # what explains the images goes first, so that it is there when they are
@@ -128,7 +134,8 @@ def optical_frame(plane: str) -> str:
 
 def calibration(view: View) -> Calibration:
     """What a plane's CameraInfo says: no distortion, and the full projection as P."""
-    return Calibration(f'plane_{view.name}', view.width, view.height, decompose(view.P)[0], view.P, 'plumb_bob', np.zeros(5))
+    return Calibration(f'plane_{view.name}', view.width, view.height, decompose(view.P)[0], view.P, 'plumb_bob',
+                       np.zeros(5))
 
 
 def true_shape(truth: np.ndarray) -> Shape:
@@ -139,7 +146,8 @@ def true_shape(truth: np.ndarray) -> Shape:
 
 
 def use_large_image_profile() -> None:
-    """Let Fast DDS carry megapixel images through shared memory, in this process (if it has not used ROS yet) and its children.
+    """Let Fast DDS carry megapixel images through shared memory, in this process (if it has not used ROS yet) and its
+    children.
 
     A profile that the user has chosen stays.
     """

@@ -26,7 +26,8 @@ DEVICE, BACKGROUND = 0.12, 0.75     # grey levels of protocol P
 NOISE_VARIANCE = 0.002              # of protocol P, on [0, 1]
 BIPLANE = carm.biplane()
 FLUOROSCOPY = imaging.SETTINGS['fluoroscopy']
-Background = Callable[[np.random.Generator, View, float], np.ndarray]      # (H, W) transmission in a view at an energy in keV
+# (H, W) transmission in a view at an energy in keV
+Background = Callable[[np.random.Generator, View, float], np.ndarray]
 PROTOCOL_P = carm.biplane(arm=carm.CArm(pixel_size_iso=0.523e-3))
 
 
@@ -62,7 +63,8 @@ class Run:
     radius: float                               # m
     renderer: str                               # one of RENDERERS
     exposure: xray.Exposure | None = None       # None: protocol P's grey levels, blur and noise
-    beams: tuple[np.ndarray, np.ndarray] | None = None     # (H, W) float32 each, transmission without the device; None: open
+    beams: tuple[np.ndarray, np.ndarray] | None = None     # (H, W) float32 each, transmission without the device;
+                                                           # None: open
     text: bool = False                          # burnt in at the border
     device: Device | None = None                # what it is made of; None: a solid rod of `radius`
     chains: tuple[Chain, Chain] | None = None   # how each plane takes and shows its images; None: as `exposure` says
@@ -80,7 +82,8 @@ class Run:
         return self._scene(whole, self._frame(whole, index, stamp_ns))
 
     def scene_averaged(self, whole: np.ndarray, detected: tuple[np.ndarray, np.ndarray]) -> Scene:
-        """The pair that shows what was `detected`, and on average over the images before, of the (N, 3) backbone `whole`."""
+        """The pair that shows what was `detected`, and on average over the images before, of the (N, 3) backbone
+        `whole`."""
         return self._scene(whole, self.shown(detected))
 
     def _scene(self, whole: np.ndarray, frame: Frame) -> Scene:
@@ -92,9 +95,11 @@ class Run:
         return self._frame(None, index, stamp_ns)
 
     def detected(self, whole: np.ndarray | None, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) float32 each: what both planes of a run with `chains` detect, before it is averaged over time and shown."""
+        """(H, W) float32 each: what both planes of a run with `chains` detect, before it is averaged over time and
+        shown."""
         rng = np.random.default_rng([self.seed, 1, index])
-        return tuple(imaging.detect(self.sharp(whole, i), chain.imaging, chain.levels, rng) for i, chain in enumerate(self.chains))
+        return tuple(imaging.detect(self.sharp(whole, i), chain.imaging, chain.levels, rng)
+                     for i, chain in enumerate(self.chains))
 
     def shown(self, detected: tuple[np.ndarray, np.ndarray], stamp_ns: int = 0) -> Frame:
         """The pair that the displays of a run with `chains` make of what was detected."""
@@ -111,11 +116,12 @@ class Run:
         return Frame(stamp_ns, FRAME_ID, images, tuple(f.view for f in self.fields))
 
     def sharp(self, whole: np.ndarray | None, i: int, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-        """(H, W) float32: plane `i` before blur and noise, as a share of full scale (P) or of the open beam (X-ray); the device's shadow is
-        moved by `shift_px` (u, v)."""
+        """(H, W) float32: plane `i` before blur and noise, as a share of full scale (P) or of the open beam (X-ray);
+        the device's shadow is moved by `shift_px` (u, v)."""
         view = self.fields[i].view
         if any(shift_px):
-            view = dataclasses.replace(view, P=view.P + np.outer([*shift_px, 0.0], view.P[2]))      # moves the principal point
+            # moves the principal point
+            view = dataclasses.replace(view, P=view.P + np.outer([*shift_px, 0.0], view.P[2]))
         bare = np.ones((view.height, view.width), np.float32)
         if self.chains is not None:
             beam = bare if whole is None else cv2.exp(-self._depth(whole, view, self.chains[i].imaging.energy_kev))
@@ -144,7 +150,8 @@ class Run:
         """(H, W) float32: of the noise that `scene` adds to each pixel of a `blurred` image of plane `i`."""
         if self.chains is not None:
             return blurred * np.float32(self.chains[i].levels.median / self.chains[i].imaging.photons)
-        return np.full_like(blurred, NOISE_VARIANCE) if self.exposure is None else blurred / np.float32(self.exposure.photons)
+        return (np.full_like(blurred, NOISE_VARIANCE) if self.exposure is None
+                else blurred / np.float32(self.exposure.photons))
 
     def _image(self, whole: np.ndarray | None, i: int, rng: np.random.Generator) -> np.ndarray:
         sharp = self.sharp(whole, i)
@@ -161,15 +168,18 @@ def grey(backbone: np.ndarray, radius: float, view: View, renderer: str) -> np.n
     """
     if renderer == 'vtk':
         return vtk_scene.render(backbone, radius, view, DEVICE, BACKGROUND)
-    return np.float32(BACKGROUND) * xray.transmission(backbone, radius, view, xray.Exposure(contrast=1 - DEVICE / BACKGROUND))
+    return np.float32(BACKGROUND) * xray.transmission(backbone, radius, view,
+                                                      xray.Exposure(contrast=1 - DEVICE / BACKGROUND))
 
 
-def protocol_p_run(seed: int, renderer: str = 'vtk', *, views=PROTOCOL_P, kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS,
-                   entering: bool = False) -> Run:
-    """The simulation of Burgner et al. 2011: a device of grey level DEVICE on BACKGROUND, 5x5 Gaussian blur, white noise of variance 0.002.
+def protocol_p_run(seed: int, renderer: str = 'vtk', *, views=PROTOCOL_P, kind: str = 'spline', lengths=LENGTHS,
+                   radius: float = RADIUS, entering: bool = False) -> Run:
+    """The simulation of Burgner et al. 2011: a device of grey level DEVICE on BACKGROUND, 5x5 Gaussian blur, white
+    noise of variance 0.002.
 
-    There `views` are 1024x1024 px of 0.523 mm and 90 degrees apart. `kind` is spline or cannula, lengths are (shortest, longest) in m;
-    `entering` puts the base outside both fields. Raises ValueError for what does not exist or does not fit.
+    There `views` are 1024x1024 px of 0.523 mm and 90 degrees apart. `kind` is spline or cannula, lengths are (shortest,
+    longest) in m; `entering` puts the base outside both fields. Raises ValueError for what does not exist or does not
+    fit.
     """
     if renderer not in RENDERERS:
         raise ValueError(f'no renderer is called {renderer!r}: there are {", ".join(RENDERERS)}')
@@ -183,16 +193,20 @@ def protocol_p(seed: int, renderer: str = 'vtk', **options) -> Scene:
     return protocol_p_run(seed, renderer, **options).scene()
 
 
-def xray_run(seed: int, *, views=BIPLANE, exposure: xray.Exposure = xray.Exposure(), anatomy: bool = True, clutter: tuple[str, ...] = (),
-             kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS, entering: bool = False, hidden_px: float = 0.0,
-             device: Device | None = None, chains: tuple[imaging.Imaging, imaging.Imaging] | None = None, background: Background | None = None) -> Run:
+def xray_run(seed: int, *, views=BIPLANE, exposure: xray.Exposure = xray.Exposure(), anatomy: bool = True,
+             clutter: tuple[str, ...] = (), kind: str = 'spline', lengths=LENGTHS, radius: float = RADIUS,
+             entering: bool = False, hidden_px: float = 0.0,
+             device: Device | None = None, chains: tuple[imaging.Imaging, imaging.Imaging] | None = None,
+             background: Background | None = None) -> Run:
     """A run that looks like fluoroscopy: a metal device in front of an anatomy-like background and any of CLUTTER.
 
-    With a `device`, an imaging chain a plane, or a `background` of one's own instead of the drawn anatomy, the physics are those of imaging.py, by default
-    FLUOROSCOPY, the rod is then one of `radius` and of exposure's contrast, and the rest of exposure does not count.
+    With a `device`, an imaging chain a plane, or a `background` of one's own instead of the drawn anatomy, the physics
+    are those of imaging.py, by default FLUOROSCOPY, the rod is then one of `radius` and of exposure's contrast, and the
+    rest of exposure does not count.
 
-    An occluder hides a part of the device in plane B only; a wire is a second, weaker device. With `hidden_px` a denser plate, in a plane
-    that the seed picks, hides so many px of the device, anywhere but near its ends. The other options are those of `protocol_p_run`.
+    An occluder hides a part of the device in plane B only; a wire is a second, weaker device. With `hidden_px` a denser
+    plate, in a plane that the seed picks, hides so many px of the device, anywhere but near its ends. The other options
+    are those of `protocol_p_run`.
     """
     if unknown := set(clutter) - set(CLUTTER):
         raise ValueError(f'no clutter is called {", ".join(sorted(unknown))}: there are {", ".join(CLUTTER)}')
@@ -223,21 +237,27 @@ def xray_run(seed: int, *, views=BIPLANE, exposure: xray.Exposure = xray.Exposur
         rng = np.random.default_rng([seed, 5])
         i = int(rng.integers(2))
         beams[i] = beams[i] * _plate_over(rng, views[i], points, hidden_px)
-    run = Run('_'.join(['xray', kind, *clutter]), seed, fields, shape, shaft, radius, 'xray', exposure, tuple(beams), 'text' in clutter)
+    run = Run('_'.join(['xray', kind, *clutter]), seed, fields, shape, shaft, radius, 'xray', exposure, tuple(beams),
+              'text' in clutter)
     return run if chains is None else with_device(run, device, chains, apertures)
 
 
-def with_device(run: Run, device: Device, chains: tuple[imaging.Imaging, imaging.Imaging], apertures=(None, None)) -> Run:
-    """The run with a `device` in place of its rod, each plane taken and shown by its imaging chain; `apertures` as imaging.levels wants them."""
-    levels = [imaging.levels(run.sharp(None, i), chain, aperture) for i, (chain, aperture) in enumerate(zip(chains, apertures))]
-    return dataclasses.replace(run, radius=device.radius, exposure=None, device=device, chains=tuple(map(Chain, chains, levels)))
+def with_device(run: Run, device: Device, chains: tuple[imaging.Imaging, imaging.Imaging],
+                apertures=(None, None)) -> Run:
+    """The run with a `device` in place of its rod, each plane taken and shown by its imaging chain; `apertures` as
+    imaging.levels wants them."""
+    levels = [imaging.levels(run.sharp(None, i), chain, aperture)
+              for i, (chain, aperture) in enumerate(zip(chains, apertures))]
+    return dataclasses.replace(run, radius=device.radius, exposure=None, device=device,
+                               chains=tuple(map(Chain, chains, levels)))
 
 
-def xray_scene(seed: int, *, pixel_size_iso: float = 0.3e-3, angle: float = np.pi / 2, photons: float = 1500.0, contrast: float = 0.25,
-               depth: int = 8, **options) -> Scene:
+def xray_scene(seed: int, *, pixel_size_iso: float = 0.3e-3, angle: float = np.pi / 2, photons: float = 1500.0,
+               contrast: float = 0.25, depth: int = 8, **options) -> Scene:
     """A still scene of `xray_run`: planes `angle` rad apart; `options` are those of `xray_run`."""
     views = carm.biplane(angle_b=(angle, 0.0), arm=carm.CArm(pixel_size_iso=pixel_size_iso))
-    return xray_run(seed, views=views, exposure=xray.Exposure(photons=photons, contrast=contrast, depth=depth), **options).scene()
+    return xray_run(seed, views=views, exposure=xray.Exposure(photons=photons, contrast=contrast, depth=depth),
+                    **options).scene()
 
 
 def still(run: Run, count: int | None = None) -> Iterator[Scene]:
@@ -246,7 +266,8 @@ def still(run: Run, count: int | None = None) -> Iterator[Scene]:
 
 
 def moving(run: Run, rate: float, count: int | None = None) -> Iterator[Scene]:
-    """`count` scenes (None: without end) of a moving device, `rate` a second. Displays that average over time drag a ghost behind it."""
+    """`count` scenes (None: without end) of a moving device, `rate` a second. Displays that average over time drag a
+    ghost behind it."""
     if run.chains is None or not any(chain.imaging.lag for chain in run.chains):
         yield from (run.scene(k / rate, k) for k in _first(count))
         return
@@ -276,16 +297,20 @@ def _aperture(rng: np.random.Generator, view: View, clutter: tuple[str, ...]) ->
 
 
 def _plate_over(rng: np.random.Generator, view: View, points: np.ndarray, hidden_px: float) -> np.ndarray:
-    """(H, W) float32: a plate of 0.3 to 2 % transmission across the image of (N, 3) points, so that it hides `hidden_px` of it."""
+    """(H, W) float32: a plate of 0.3 to 2 % transmission across the image of (N, 3) points, so that it hides
+    `hidden_px` of it."""
     k = int(len(points) * rng.uniform(0.2, 0.8))
     centre, ahead = project(view.P, points[[k, k + 5]])
     turn = np.arctan2(*(ahead - centre)[::-1])
-    return surroundings.plate((view.height, view.width), centre, (hidden_px, rng.uniform(30, 90)), turn, rng.uniform(0.003, 0.02))
+    return surroundings.plate((view.height, view.width), centre, (hidden_px, rng.uniform(30, 90)), turn,
+                              rng.uniform(0.003, 0.02))
 
 
 @lru_cache(4)
 def _depth(whole: bytes, device: Device, view: View, energy_kev: float, renderer: str) -> np.ndarray:
-    """(H, W) float32 of `Run._depth`, kept for both planes with and without what stands behind: it takes longest by far."""
-    depth = (gvxr_scene if renderer == 'gvxr' else xray).optical_depth(np.frombuffer(whole).reshape(-1, 3), device, view, energy_kev)
+    """(H, W) float32 of `Run._depth`, kept for both planes with and without what stands behind: it takes longest by
+    far."""
+    depth = (gvxr_scene if renderer == 'gvxr' else xray).optical_depth(np.frombuffer(whole).reshape(-1, 3), device,
+                                                                       view, energy_kev)
     depth.flags.writeable = False
     return depth

@@ -1,7 +1,8 @@
 """Robot shapes with known backbones: random smooth splines and a two-tube active cannula, still or moving.
 
-A shape is a frozen set of parameters. Its `backbone()` is the (N, 3) curve in the reference frame, m, base to tip, in equal
-arc-length steps, the last point exactly the tip. In the shape's own frame the base is the origin and its tangent is +x.
+A shape is a frozen set of parameters. Its `backbone()` is the (N, 3) curve in the reference frame, m, base to tip, in
+equal arc-length steps, the last point exactly the tip. In the shape's own frame the base is the origin and its tangent
+is +x.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Pose:
 
 @dataclass(frozen=True)
 class Section:
-    """A piece of constant curvature; it bends in the plane at `rotation` about the tangent of the whole curve's base."""
+    """A piece of constant curvature; it bends in the plane at `rotation` about the tangent of the whole curve's
+    base."""
 
     length: float       # m
     curvature: float    # 1/m, 0: straight
@@ -62,7 +64,8 @@ class Spline:
 
 @dataclass(frozen=True)
 class Cannula:
-    """A two-tube active cannula: the section where both tubes lie, then the inner tube alone; each bends with constant curvature.
+    """A two-tube active cannula: the section where both tubes lie, then the inner tube alone; each bends with constant
+    curvature.
 
     Rotations are those of the tubes at the base; equal ones keep the cannula in one plane.
     """
@@ -101,8 +104,10 @@ def chain(sections: Sequence[Section], step: float = STEP) -> np.ndarray:
     return points
 
 
-def random_spline(rng: np.random.Generator, length: float, max_curvature: float = MAX_CURVATURE, max_turn: float = np.deg2rad(75)) -> Spline:
-    """A robot-like curve of `length` m at a random pose about the origin; it never bends tighter than `max_curvature` (1/m).
+def random_spline(rng: np.random.Generator, length: float, max_curvature: float = MAX_CURVATURE,
+                  max_turn: float = np.deg2rad(75)) -> Spline:
+    """A robot-like curve of `length` m at a random pose about the origin; it never bends tighter than `max_curvature`
+    (1/m).
 
     Its direction strays at most `max_turn` rad from the base's in yaw and in pitch, so it does not curl up.
     """
@@ -110,7 +115,8 @@ def random_spline(rng: np.random.Generator, length: float, max_curvature: float 
     bends = np.cumsum(rng.normal(size=(knots, 2)), axis=0)
     shape = Spline(length, bends - bends[0])
     s = np.linspace(0.0, length, 500)
-    tightest = np.hypot(*shape.angles()(s, 1).T).max()      # a bound of the curvature, which is less where the curve is pitched
+    # a bound of the curvature, which is less where the curve is pitched
+    tightest = np.hypot(*shape.angles()(s, 1).T).max()
     scale = min(rng.uniform(0.5, 1.0) * max_curvature / tightest, max_turn / np.abs(shape.angles()(s)).max())
     return centred(rng, dataclasses.replace(shape, bends=shape.bends * scale))
 
@@ -141,11 +147,12 @@ def moving(shape: Spline | Cannula, t: float, period: float = 8.0) -> Spline | C
 def posed(shape: Spline | Cannula, slide: float, bend: float) -> Spline | Cannula:
     """`shape` moved by shares of its motion, both in [0, 1]; it never gets longer or bends tighter than at 0, 0.
 
-    A spline slides back along its own path by a fifth and straightens by 30 %; a cannula draws its inner tube in by two fifths and turns
-    it by 0.6 rad.
+    A spline slides back along its own path by a fifth and straightens by 30 %; a cannula draws its inner tube in by two
+    fifths and turns it by 0.6 rad.
     """
     if isinstance(shape, Cannula):
-        return dataclasses.replace(shape, inner_length=shape.inner_length * (1 - 0.4 * slide), inner_rotation=shape.inner_rotation + 0.6 * bend)
+        return dataclasses.replace(shape, inner_length=shape.inner_length * (1 - 0.4 * slide),
+                                   inner_rotation=shape.inner_rotation + 0.6 * bend)
     return dataclasses.replace(shape, length=shape.length * (1 - 0.2 * slide), bends=shape.bends * (1 - 0.3 * bend))
 
 
@@ -157,7 +164,8 @@ def _steps(length: float, step: float) -> np.ndarray:
 
 
 def _arc(s: np.ndarray, curvature: float, rotation: float) -> np.ndarray:
-    """(N, 3) points at arc lengths `s` of a circular arc from the origin along +x, bending in the plane at `rotation` about x."""
+    """(N, 3) points at arc lengths `s` of a circular arc from the origin along +x, bending in the plane at `rotation`
+    about x."""
     half = curvature * s / 2
     forward = s * np.sinc(2 * half / np.pi)                             # sin(ks) / k
     aside = s * np.sin(half) * np.sinc(half / np.pi)                    # (1 - cos(ks)) / k

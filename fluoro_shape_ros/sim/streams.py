@@ -1,8 +1,9 @@
-"""Streams of fluoroscopy: a device that advances, withdraws, bends and swings before a patient who breathes, and what goes wrong meanwhile.
+"""Streams of fluoroscopy: a device that advances, withdraws, bends and swings before a patient who breathes, and what
+goes wrong meanwhile.
 
-A stream is drawn from a seed: a preset of `devices`, planes, imaging chains, background, motion, and the faults of its kind, one of KINDS. The
-background is drawn or projected once and then moved (breathing.py); the device is drawn for every pair. As in variety.py a stream is drawn anew until
-its device can be seen in both planes.
+A stream is drawn from a seed: a preset of `devices`, planes, imaging chains, background, motion, and the faults of its
+kind, one of KINDS. The background is drawn or projected once and then moved (breathing.py); the device is drawn for
+every pair. As in variety.py a stream is drawn anew until its device can be seen in both planes.
 """
 
 from __future__ import annotations
@@ -63,8 +64,9 @@ class Stream:
     run: Run            # device, fields, imaging chains
     motion: motion.Motion
     backgrounds: tuple[breathing.Breathing, breathing.Breathing]        # while the stream is taken ...
-    before: tuple[breathing.Breathing, breathing.Breathing] | None      # ... and while its mask was; None: there is none
-    apertures: tuple[np.ndarray | None, np.ndarray | None]      # (H, W) float32, what blades and intensifier let through
+    before: tuple[breathing.Breathing, breathing.Breathing] | None      # ... and while its mask was;
+                                                                        # None: there is none
+    apertures: tuple[np.ndarray | None, np.ndarray | None]  # (H, W) float32, what blades and intensifier let through
     wire: faults.Wire | None = None
     bolus: faults.Bolus | None = None
     dark: faults.Dark | None = None
@@ -79,22 +81,28 @@ class Stream:
         for k in range(count):
             whole, dark = self.backbone(k / self.rate), [self._dark(i, k / self.rate) for i in (0, 1)]
             detected = self._lit(k / self.rate).detected(whole, k)
-            averaged = [None if off else d if last is None else np.float32(chain.imaging.lag) * last + np.float32(1 - chain.imaging.lag) * d
-                        for d, last, off, chain in zip(detected, averaged, dark, self.run.chains)]     # it begins anew once there are X-rays again
-            shown = self.run.shown(tuple(np.zeros_like(d) if a is None else a for d, a in zip(detected, averaged)), round(k / self.rate * 1e9))
+            averaged = [None if off else d if last is None
+                        else np.float32(chain.imaging.lag) * last + np.float32(1 - chain.imaging.lag) * d
+                        # it begins anew once there are X-rays again
+                        for d, last, off, chain in zip(detected, averaged, dark, self.run.chains)]
+            shown = self.run.shown(tuple(np.zeros_like(d) if a is None else a for d, a in zip(detected, averaged)),
+                                   round(k / self.rate * 1e9))
             truth = placement.seen_in_both(whole, self.run.fields)
             yield Moment(Scene(shown, truth, self.run.radius, truth[0], self.kind, self.run.seed), not any(dark), whole)
 
     def mask(self, count: int) -> list[Frame]:
-        """`count` pairs without the device, taken MASK_AGE_S before the stream begins; none where this kind has no mask."""
+        """`count` pairs without the device, taken MASK_AGE_S before the stream begins; none where this kind has no
+        mask."""
         if self.before is None:
             return []
         times = [-MASK_AGE_S - k / self.rate for k in range(count)]
-        return [self.run.shown(self.with_beams([b.at(t) for b in self.before]).detected(None, MASK_INDEX + k)) for k, t in enumerate(times)]
+        return [self.run.shown(self.with_beams([b.at(t) for b in self.before]).detected(None, MASK_INDEX + k))
+                for k, t in enumerate(times)]
 
     def with_beams(self, beams: list[np.ndarray]) -> Run:
         """The run with these (H, W) shares of the beam behind the device, as far as its apertures are open."""
-        return dataclasses.replace(self.run, beams=tuple(beam if a is None else beam * a for beam, a in zip(beams, self.apertures)))
+        return dataclasses.replace(self.run, beams=tuple(beam if a is None else beam * a
+                                                         for beam, a in zip(beams, self.apertures)))
 
     def said(self) -> str:
         """What was drawn, in a line."""
@@ -120,8 +128,8 @@ class Stream:
 
 
 def draw(seed: int, kind: str, volume: ct.Volume | None = None) -> Stream:
-    """The first stream of a kind of KINDS that a seed draws whose device can be seen; before a CT, or drawn anatomy. Raises ValueError for another kind,
-    and where none turns up."""
+    """The first stream of a kind of KINDS that a seed draws whose device can be seen; before a CT, or drawn anatomy.
+    Raises ValueError for another kind, and where none turns up."""
     if kind not in KINDS:
         raise ValueError(f'no kind of stream is called {kind!r}: there are {", ".join(KINDS)}')
     for attempt in range(seed * PATIENTS, (seed + 1) * PATIENTS):
@@ -136,7 +144,8 @@ def draw(seed: int, kind: str, volume: ct.Volume | None = None) -> Stream:
     raise ValueError(f'no stream of seed {seed} can be seen ({PATIENTS * DEVICES} drawn)')
 
 
-def _drawn(rng: np.random.Generator, seed: int, kind: str, views: tuple[View, View], apertures, patient: breathing.Patient) -> Stream | None:
+def _drawn(rng: np.random.Generator, seed: int, kind: str, views: tuple[View, View], apertures,
+           patient: breathing.Patient) -> Stream | None:
     """A stream without faults but lag; None where its device does not stay in both fields or can't be seen."""
     device, rate = str(rng.choice(presets())), float(rng.choice(RATES))
     lag = LAG if kind in ('lag', 'mixed') else (0.0, 0.0)

@@ -1,4 +1,5 @@
-"""Runs from a world as wide as the clinic: device, geometry, anatomy, dose, blur, scatter and display drawn at random, planes unequal.
+"""Runs from a world as wide as the clinic: device, geometry, anatomy, dose, blur, scatter and display drawn at random,
+planes unequal.
 
 What no person could find is not asked for: a run is drawn anew until its device is `visible` in both planes.
 """
@@ -33,9 +34,11 @@ SHAPES = ('spline', 'cannula', 'bent')
 LENGTHS = (0.040, 0.188)                    # m, where the field has room ...
 SHARE = 0.6                                 # ... for so much of its width at the isocentre
 DENSITY = (0.7, 1.5)                        # powers that drawn anatomy is raised to
-PARTS, PART = (surroundings.tissue, surroundings.spine, surroundings.ribs, surroundings.vessels), 0.75   # of drawn anatomy, and the share that has each
+# of drawn anatomy, and the share that has each
+PARTS, PART = (surroundings.tissue, surroundings.spine, surroundings.ribs, surroundings.vessels), 0.75
 ENTERING, ROUND, COLLIMATED, LEADS, TEXT = 0.3, 0.2, 0.25, 0.1, 0.2     # shares of the runs
-VISIBLE, BEFORE_ANATOMY = 1.0, 2.0          # see `visibility`: the signal to noise that is found at a glance, before nothing and before anatomy ...
+VISIBLE, BEFORE_ANATOMY = 1.0, 2.0          # see `visibility`: the signal to noise that is found at a glance, before
+                                            # nothing and before anatomy ...
 DARKER = 0.02                               # ... on a display that shows the device so much darker
 PIECE = 0.008                               # m
 ATTEMPTS = 50
@@ -55,16 +58,19 @@ def device_run(seed: int, preset: str | None = None) -> Run:
 
 
 def ct_run(seed: int, volume: ct.Volume, preset: str | None = None) -> Run:
-    """A device of the presets (None: the seed picks one, in turn) in a CT volume from anywhere; every second one enters through the border."""
+    """A device of the presets (None: the seed picks one, in turn) in a CT volume from anywhere; every second one enters
+    through the border."""
     kinds = presets()
     preset = preset or kinds[seed % len(kinds)]
     across = min(n * spacing for n, spacing in zip(volume.hu.shape[1:], volume.spacing_m[1:]))
     coarsest = float(np.clip(across / SIZE_PX, 2 * PIXELS[0], PIXELS[1]))       # the body fills the field
-    return _drawn(seed, preset, lambda rng: load_device(preset), lambda rng: in_ct(volume, rng), bool(seed // len(kinds) % 2), coarsest)
+    return _drawn(seed, preset, lambda rng: load_device(preset), lambda rng: in_ct(volume, rng),
+                  bool(seed // len(kinds) % 2), coarsest)
 
 
 def gvxr_run(seed: int) -> Run:
-    """A rod or a hollow tube in tissue, drawn by gVirtualXray at 0.2 mm a pixel: contrasts from 10 to 90 %, nothing in the way."""
+    """A rod or a hollow tube in tissue, drawn by gVirtualXray at 0.2 mm a pixel: contrasts from 10 to 90 %, nothing in
+    the way."""
     rng = np.random.default_rng([seed, 9])
     radius, contrast = rng.uniform(0.4e-3, 1.2e-3), rng.uniform(0.1, 0.9)
     lumen = radius * rng.uniform(0.5, 0.8) * (seed % 2)
@@ -73,18 +79,22 @@ def gvxr_run(seed: int) -> Run:
     views = carm.biplane(angle_b=(between, 0.0), arm=carm.CArm(pixel_size_iso=0.2e-3))
     fields = tuple(placement.Field(v) for v in views)
     shape, shaft = placement.place(rng, fields, 'spline', (0.05, 0.12), entering=False)
-    chain = imaging.Imaging(energy_kev=REFERENCE_KEV, photons=1500.0, blur_px=0.7, noise_px=0.4, scatter=0.1, display=str(rng.choice(imaging.DISPLAYS)), bits=12)
+    chain = imaging.Imaging(energy_kev=REFERENCE_KEV, photons=1500.0, blur_px=0.7, noise_px=0.4, scatter=0.1,
+                            display=str(rng.choice(imaging.DISPLAYS)), bits=12)
     levels = imaging.levels(np.ones((views[0].height, views[0].width), np.float32), chain)
-    return Run(('rod', 'tube')[seed % 2], seed, fields, shape, shaft, radius, 'gvxr', device=device, chains=(Chain(chain, levels),) * 2)
+    return Run(('rod', 'tube')[seed % 2], seed, fields, shape, shaft, radius, 'gvxr', device=device,
+               chains=(Chain(chain, levels),) * 2)
 
 
 def visibility(run: Run, whole: np.ndarray | None = None) -> tuple[float, float]:
-    """How well a person can see a run's device where it shows least, in the plane that shows it less: (signal to noise, grey levels).
+    """How well a person can see a run's device where it shows least, in the plane that shows it less: (signal to noise,
+    grey levels).
 
     `whole` is its (N, 3) backbone; None: at the start.
 
-    Both are taken in pieces of PIECE, and are those of the lowest tenth of the pieces: the signal-to-noise ratio that a matched filter has for each px of length (Rose
-    1948 asks for 5 in all: 25 px at 1), and by how much the display shows the device darker than what lies behind it, as a share of its full scale.
+    Both are taken in pieces of PIECE, and are those of the lowest tenth of the pieces: the signal-to-noise ratio that a
+    matched filter has for each px of length (Rose 1948 asks for 5 in all: 25 px at 1), and by how much the display
+    shows the device darker than what lies behind it, as a share of its full scale.
     """
     whole, found = run.backbone() if whole is None else whole, []
     truth = placement.seen_in_both(whole, run.fields)
@@ -94,10 +104,11 @@ def visibility(run: Run, whole: np.ndarray | None = None) -> tuple[float, float]
         before = run.blurred(without, i)
         change = run.blurred(shown_with, i) - before
         ratio = change**2 / run.noise_variance(before, i)
-        if chain.imaging.noise_px > 0.1:    # what correlated noise of this variance has at the low frequencies of a line
+        if chain.imaging.noise_px > 0.1:   # what correlated noise of this variance has at the low frequencies of a line
             ratio /= 1 + 4 * np.pi * np.float32(chain.imaging.noise_px)**2
         fine = dataclasses.replace(chain.imaging, bits=16)
-        shown = [imaging.show(imaging.detect(beam, fine, chain.levels, None), fine, chain.levels) / 65535 for beam in (without, shown_with)]
+        shown = [imaging.show(imaging.detect(beam, fine, chain.levels, None), fine, chain.levels) / 65535
+                 for beam in (without, shown_with)]
         v, u = np.nonzero(np.abs(change) > 0.01 * np.abs(change).max())
         uv = project(field.view.P, truth)
         piece = pieces[cKDTree(uv).query(np.c_[u, v])[1]]
@@ -115,21 +126,24 @@ def visible(run: Run, before_anatomy: bool, whole: np.ndarray | None = None) -> 
     return signal >= (BEFORE_ANATOMY if before_anatomy else VISIBLE) and darker >= DARKER
 
 
-def _drawn(seed: int, name: str, make_device: Callable[[np.random.Generator], Device], backgrounds: Backgrounds | None, entering: bool | None = None,
-           coarsest: float = PIXELS[1]) -> Run:
+def _drawn(seed: int, name: str, make_device: Callable[[np.random.Generator], Device], backgrounds: Backgrounds | None,
+           entering: bool | None = None, coarsest: float = PIXELS[1]) -> Run:
     """The first visible run that a seed draws. Raises ValueError where none turns up."""
     for attempt in range(seed * ATTEMPTS, (seed + 1) * ATTEMPTS):
         rng = np.random.default_rng([attempt, 7])
         device, views = make_device(rng), draw_views(rng, coarsest)
         room = SHARE * SIZE_PX / max(pixels_per_metre(v.P, np.zeros((1, 3))) for v in views)
-        drawn: dict[str, Any] = dict(views=views, kind=str(rng.choice(SHAPES)), lengths=(min(LENGTHS[0], 0.6 * room), min(LENGTHS[1], room)), device=device,
-                     chains=(imaging.draw(rng), imaging.draw(rng)), entering=bool(rng.random() < ENTERING) if entering is None else entering,
+        drawn: dict[str, Any] = dict(views=views, kind=str(rng.choice(SHAPES)),
+                                     lengths=(min(LENGTHS[0], 0.6 * room), min(LENGTHS[1], room)), device=device,
+                     chains=(imaging.draw(rng), imaging.draw(rng)),
+                                     entering=bool(rng.random() < ENTERING) if entering is None else entering,
                      clutter=_clutter(rng, backgrounds is not None), anatomy=False)
         try:
             alone = xray_run(attempt, **drawn)
         except ValueError:      # no such shape fits
             continue
-        if not visible(alone, backgrounds is not None):    # most that can't be seen can't be seen before nothing either, which takes less time to find out
+        # most that can't be seen can't be seen before nothing either, which takes less time to find out
+        if not visible(alone, backgrounds is not None):
             continue
         run = xray_run(attempt, **drawn, background=backgrounds(rng)) if backgrounds else alone
         if run is alone or visible(run, True):
@@ -141,13 +155,15 @@ def _clutter(rng: np.random.Generator, before_anatomy: bool) -> tuple[str, ...]:
     """What stands in the beam of both planes, of CLUTTER; leads and text only before anatomy."""
     opening, others = rng.random(), rng.random(2)
     found = ['field'] if opening < ROUND else ['blades'] if opening < ROUND + COLLIMATED else []
-    return (*found, *(name for name, drawn, share in zip(('leads', 'text'), others, (LEADS, TEXT)) if before_anatomy and drawn < share))
+    return (*found, *(name for name, drawn, share in zip(('leads', 'text'), others, (LEADS, TEXT))
+                      if before_anatomy and drawn < share))
 
 
 def draw_views(rng: np.random.Generator, coarsest: float = PIXELS[1]) -> tuple[View, View]:
-    """Planes A and B of a biplane system, or of a C-arm that turned: angles, distances and pixels (up to `coarsest` m) drawn, each plane with its own
-    principal point."""
-    pixel, between = np.exp(rng.uniform(np.log(PIXELS[0]), np.log(coarsest))), rng.uniform(*BETWEEN) * rng.choice([-1, 1])
+    """Planes A and B of a biplane system, or of a C-arm that turned: angles, distances and pixels (up to `coarsest` m)
+    drawn, each plane with its own principal point."""
+    pixel, between = (np.exp(rng.uniform(np.log(PIXELS[0]), np.log(coarsest))),
+                      rng.uniform(*BETWEEN) * rng.choice([-1, 1]))
     angles = rng.uniform(-PRIMARY, PRIMARY), rng.uniform(-SECONDARY, SECONDARY)
     views = []
     for plane, primary, secondary in (('a', *angles), ('b', angles[0] + between, rng.uniform(-SECONDARY, SECONDARY))):

@@ -1,4 +1,5 @@
-"""The seed's renderer: a VTK tube seen by a virtual camera, blurred with a 5x5 Gaussian, with white noise (Burgner et al. 2011, Results).
+"""The seed's renderer: a VTK tube seen by a virtual camera, blurred with a 5x5 Gaussian, with white noise (Burgner et
+al. 2011, Results).
 
 It shares nothing with `xray` but the View: the tube is a surface here, and a volume there.
 """
@@ -20,7 +21,8 @@ from .carm import shadow_box
 
 SIDES = 32          # of the tube: its mean width is 0.3 % below the circle's
 SUPERSAMPLING = 4   # VTK's edges are hard: so many samples a pixel and axis make them area fractions ...
-# ... taken once for each of these shifts (u, v in samples), so that an edge along an axis is met at 16 places a pixel, not at 4
+# ... taken once for each of these shifts (u, v in samples), so that an edge along an axis is met at 16 places a pixel,
+# not at 4
 SHIFTS = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))
 
 NO_OPENGL = 'the VTK renderer finds no OpenGL: it needs a display, or libEGL with a (software) driver'
@@ -30,7 +32,8 @@ class NoOpenGL(OSError):
     """VTK is there, but nothing that it could draw with."""
 
 
-def render(backbone: np.ndarray, radius: float, view: View, device: float = 0.12, background: float = 0.75) -> np.ndarray:
+def render(backbone: np.ndarray, radius: float, view: View, device: float = 0.12,
+           background: float = 0.75) -> np.ndarray:
     """(H, W) float32 noise-free grey image in [0, 1] of a tube of `radius` m, as VTK draws it.
 
     Raises ImportError where VTK is missing and NoOpenGL where it can't draw.
@@ -51,7 +54,8 @@ def coverage(backbone: np.ndarray, radius: float, view: View) -> np.ndarray:
 
 
 def device_coverage(backbone: np.ndarray, device: Device, view: View) -> np.ndarray:
-    """(H, W) float32: the fraction of each pixel that the outline of a device about the (N, 3) backbone, base to tip, covers. Errors: `render`."""
+    """(H, W) float32: the fraction of each pixel that the outline of a device about the (N, 3) backbone, base to tip,
+    covers. Errors: `render`."""
     s = arc_length(backbone)
     tubes = []
     for piece in device.pieces(s[-1]):
@@ -61,8 +65,10 @@ def device_coverage(backbone: np.ndarray, device: Device, view: View) -> np.ndar
     return _covered(tubes, shadow_box(view, backbone, device.widest), view)
 
 
-def _covered(tubes: list[tuple[np.ndarray, float]], box: tuple[np.ndarray, np.ndarray] | None, view: View) -> np.ndarray:
-    """(H, W) float32: the fraction of each pixel that tubes, (N, 3) points and a radius in m each, cover together; None for `box`: none is in sight."""
+def _covered(tubes: list[tuple[np.ndarray, float]], box: tuple[np.ndarray, np.ndarray] | None,
+             view: View) -> np.ndarray:
+    """(H, W) float32: the fraction of each pixel that tubes, (N, 3) points and a radius in m each, cover together; None
+    for `box`: none is in sight."""
     image = np.zeros((view.height, view.width), np.float32)
     if box is None:
         return image
@@ -70,12 +76,14 @@ def _covered(tubes: list[tuple[np.ndarray, float]], box: tuple[np.ndarray, np.nd
     K, R, t = decompose(view.P)
     crop = np.array([[1.0, 0.0, -low[0]], [0.0, 1.0, -low[1]], [0.0, 0.0, 1.0]]) @ K
     drawn = _draw([(points @ R.T + t, radius) for points, radius in tubes], crop, high - low)
-    image[low[1]:high[1], low[0]:high[0]] = cv2.resize(drawn, tuple(int(n) for n in high - low), interpolation=cv2.INTER_AREA)
+    image[low[1]:high[1], low[0]:high[0]] = cv2.resize(drawn, tuple(int(n) for n in high - low),
+                                                       interpolation=cv2.INTER_AREA)
     return image
 
 
 def _draw(tubes: list[tuple[np.ndarray, float]], K: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(h, w) float32 in [0, 1]: tubes, (N, 3) points of the camera's frame (z along the beam) and a radius each, seen with intrinsics K.
+    """(h, w) float32 in [0, 1]: tubes, (N, 3) points of the camera's frame (z along the beam) and a radius each, seen
+    with intrinsics K.
 
     `size` is (w, h) in px of K; the image has SUPERSAMPLING times as many.
     """
@@ -85,7 +93,8 @@ def _draw(tubes: list[tuple[np.ndarray, float]], K: np.ndarray, size: np.ndarray
         from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
         from vtkmodules.vtkRenderingCore import vtkRenderer
     except ImportError as error:
-        raise ImportError(f'the VTK renderer needs vtk, which is not installed here ({error}): pip install "fluoro_shape_ros[vtk]"') from error
+        raise ImportError(f'the VTK renderer needs vtk, which is not installed here ({error}): pip install '
+                          '"fluoro_shape_ros[vtk]"') from error
     renderer = vtkRenderer()
     for points, radius in tubes:
         renderer.AddActor(_tube(points * [1.0, -1.0, -1.0], radius))        # OpenGL: y up, looking along -z
@@ -165,10 +174,12 @@ def _offscreen_window():
     from vtkmodules import vtkRenderingOpenGL2
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
     headless = sys.platform.startswith('linux') and not os.environ.get('DISPLAY')
-    if headless and not any(map(_loads, ('libEGL.so.1', 'libOSMesa.so.8', 'libOSMesa.so'))):     # VTK crashes instead of saying so
+    # VTK crashes instead of saying so
+    if headless and not any(map(_loads, ('libEGL.so.1', 'libOSMesa.so.8', 'libOSMesa.so'))):
         raise NoOpenGL(NO_OPENGL)
     # asked for by name, since VTK's own search tries X first and complains aloud
-    window = vtkRenderingOpenGL2.vtkEGLRenderWindow() if headless and hasattr(vtkRenderingOpenGL2, 'vtkEGLRenderWindow') else vtkRenderWindow()
+    window = (vtkRenderingOpenGL2.vtkEGLRenderWindow()
+              if headless and hasattr(vtkRenderingOpenGL2, 'vtkEGLRenderWindow') else vtkRenderWindow())
     window.SetOffScreenRendering(True)
     if not window.SupportsOpenGL():
         raise NoOpenGL(NO_OPENGL)

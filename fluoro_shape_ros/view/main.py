@@ -29,20 +29,26 @@ def main(argv=None) -> int:
 def make_parser() -> argparse.ArgumentParser:
     """What the command line may have."""
     parser = argparse.ArgumentParser(
-        PROG, description='See both planes with overlays, the backbone with its tip ellipsoid between sources and detectors, ground truth where a simulator publishes it, '
-                          'and confidence, sigma, latency and outcomes over time: live from nodes, or from a bag. Ends with Ctrl-C.')
+        PROG, description='See both planes with overlays, the backbone with its tip ellipsoid between sources and '
+                          'detectors, ground truth where a simulator publishes it, and confidence, sigma, '
+                          'latency and outcomes over time: live from nodes, or from a bag. Ends with Ctrl-C.')
     add = parser.add_argument
-    add('namespaces', nargs='*', type=namespace, metavar='NAMESPACE', help='of the nodes to watch (default: /; of a bag: all that have results in it)')
-    add('--bag', metavar='BAG', help='a bag with results instead, of fluoro_shape_replay (with --with-images it shows them too) or of ros2 bag record')
+    add('namespaces', nargs='*', type=namespace, metavar='NAMESPACE',
+        help='of the nodes to watch (default: /; of a bag: all that have results in it)')
+    add('--bag', metavar='BAG', help='a bag with results instead, of fluoro_shape_replay '
+                                     '(with --with-images it shows them too) or of ros2 bag record')
     to = parser.add_mutually_exclusive_group()
     to.add_argument('--web', action='store_true', help='a page for any browser, instead of a window of Rerun\'s own')
     to.add_argument('--save', type=Path, metavar='FILE.rrd', help='a new file instead, which `rerun FILE.rrd` shows')
-    add('--bind', default=LOOPBACK, metavar='ADDRESS', help='of the page (default: %(default)s, for browsers on this machine alone); there is no password')
+    add('--bind', default=LOOPBACK, metavar='ADDRESS',
+        help='of the page (default: %(default)s, for browsers on this machine alone); there is no password')
     add('--port', type=port, default=PORT, metavar='N', help='of the page (default: %(default)s)')
     add('--no-images', action='store_true', help='leave the images out: a node draws overlays only for those who look')
-    add('--wait', type=cli.positive, default=20.0, metavar='S', help='give up where no node was heard within S seconds (default: %(default)g)')
+    add('--wait', type=cli.positive, default=20.0, metavar='S',
+        help='give up where no node was heard within S seconds (default: %(default)g)')
     add('--seconds', type=cli.positive, metavar='S', help='end after S seconds (default: with Ctrl-C)')
-    add('-r', '--remap', action='append', default=[], metavar='FROM:=TO', help='another name for a topic, as for the node; may be repeated')
+    add('-r', '--remap', action='append', default=[], metavar='FROM:=TO',
+        help='another name for a topic, as for the node; may be repeated')
     add('--ros-args', action='store_true', help=argparse.SUPPRESS)      # so that -r can be given as to the node
     return parser
 
@@ -84,7 +90,8 @@ def _live(args, rerun, told: threading.Event, parser: argparse.ArgumentParser) -
     names = list(dict.fromkeys(args.namespaces or ['/']))
     with _shown(args, rerun, names) as (recording, closed):
         try:
-            watch({name: NodeView(into(recording), name) for name in names}, ros_arguments=['--ros-args', *(word for rule in args.remap for word in ('-r', rule))],
+            watch({name: NodeView(into(recording), name) for name in names},
+                  ros_arguments=['--ros-args', *(word for rule in args.remap for word in ('-r', rule))],
                   images=not args.no_images, wait_s=args.wait, stop=lambda: told.is_set() or closed())
         except ValueError as error:
             parser.error(' '.join(str(error).split()))
@@ -102,8 +109,10 @@ def _recorded(args, rerun, told: threading.Event) -> int:
             names = list(dict.fromkeys(args.namespaces or known or ['/']))
             topics = {name: topics_of(name, bag.types(), others, not args.no_images) for name in names}
             if without := [name for name in names if not RESULTS & set(topics[name].values())]:
-                raise cli.ToolError(f'{args.bag}: there are no results ({" or ".join(sorted(RESULTS))}) in {", ".join(without)}; '
-                                    + (f'those in it are in {", ".join(known)}' if known else 'fluoro_shape_replay makes a bag that has them'))
+                raise cli.ToolError(f'{args.bag}: there are no results ({" or ".join(sorted(RESULTS))}) in '
+                                    f'{", ".join(without)}; '
+                                    + (f'those in it are in {", ".join(known)}'
+                                       if known else 'fluoro_shape_replay makes a bag that has them'))
             with _shown(args, rerun, names, has_latency(bag)) as (recording, closed):
                 def stop() -> bool:
                     return told.is_set() or closed()
@@ -129,7 +138,8 @@ def _shown(args, rerun, names: list[str], latency: bool = True) -> Iterator[tupl
             _save(recording, args.save)
             closed = lambda: False      # noqa: E731
         else:
-            if not args.web and sys.platform == 'linux' and not (os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')):
+            if not args.web and sys.platform == 'linux' and not (os.environ.get('DISPLAY')
+                                                                 or os.environ.get('WAYLAND_DISPLAY')):
                 raise cli.ToolError('there is no display for a window here; take --web or --save FILE.rrd')
             data_port, page_port = free_port(), free_port() if args.web else None
             if page_port is not None:       # first, since it tells at once where the port is taken

@@ -39,7 +39,8 @@ TOPICS = {
 DIAGNOSTICS = '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray'
 
 
-Log = Callable[[int | None, scene.Scene], None]     # takes a stamp in ns (None: for all times), and archetypes by entity path
+# takes a stamp in ns (None: for all times), and archetypes by entity path
+Log = Callable[[int | None, scene.Scene], None]
 
 
 def into(recording: rr.RecordingStream) -> Log:
@@ -53,7 +54,8 @@ def into(recording: rr.RecordingStream) -> Log:
 
 
 class NodeView:
-    """Takes the messages of a node in an absolute `namespace` and logs what they show, below the entity `root_of(namespace)`."""
+    """Takes the messages of a node in an absolute `namespace` and logs what they show, below the entity
+    `root_of(namespace)`."""
 
     def __init__(self, log: Log, namespace: str):
         self.heard = False      # anything of the node itself
@@ -71,7 +73,8 @@ class NodeView:
         self._log(None, scene.styles())
 
     def take(self, topic: str, msg, arrived_ns: int) -> None:
-        """A message of a topic in TOPICS, `plane_a/image_raw`, or DIAGNOSTICS, that came at `arrived_ns`. What makes no sense is left out."""
+        """A message of a topic in TOPICS, `plane_a/image_raw`, or DIAGNOSTICS, that came at `arrived_ns`. What makes no
+        sense is left out."""
         try:
             self._handler(topic)(topic, msg, arrived_ns)
         except (BadImage, BadCameraInfo, BadPath):      # the node names them in its diagnostics
@@ -79,7 +82,8 @@ class NodeView:
 
     def _handler(self, topic: str) -> Callable:
         name = topic.rpartition('/')[2]
-        return {'camera_info': self._on_camera, 'backbone': self._on_path, 'backbone_points': self._on_points, 'tip_pose': self._on_tip, 'overlay': self._on_overlay,
+        return {'camera_info': self._on_camera, 'backbone': self._on_path, 'backbone_points': self._on_points,
+                'tip_pose': self._on_tip, 'overlay': self._on_overlay,
                 'image_raw': self._on_image, 'diagnostics': self._on_diagnostics}[name]
 
     # ---- images and cameras
@@ -87,11 +91,13 @@ class NodeView:
     def _on_camera(self, topic: str, msg, _) -> None:
         plane, before = topic[len('plane_')], self._views.get(topic[len('plane_')])
         view = self._views[plane] = camera_info_to_view(msg, plane, received_shape(msg))
-        self._moved |= before is None or not np.array_equal(before.P, view.P) or (before.width, before.height) != (view.width, view.height)
+        self._moved |= (before is None or not np.array_equal(before.P, view.P)
+                        or (before.width, before.height) != (view.width, view.height))
 
     def _on_overlay(self, topic: str, msg, _) -> None:
         self.heard, stamp = True, stamp_ns(msg)
-        if stamp != self._overlaid and stamp not in self._found:    # its backbone would have come before: the pair has no result
+        # its backbone would have come before: the pair has no result
+        if stamp != self._overlaid and stamp not in self._found:
             self._log(stamp, scene.nothing())
         self._overlaid = stamp
         self._picture(topic[len('plane_')], coloured(msg), stamp)
@@ -106,7 +112,8 @@ class NodeView:
         self._log(stamp, scene.picture(plane, image))
 
     def _pair(self, stamp: int) -> None:
-        """A pair with this stamp is there: time goes on, and the cameras that hold for it are drawn where they have moved."""
+        """A pair with this stamp is there: time goes on, and the cameras that hold for it are drawn where they have
+        moved."""
         self._newest = stamp
         if not self._moved or len(self._views) < 2:
             return
@@ -126,8 +133,10 @@ class NodeView:
         rows = cloud_to_rows(msg)
         self._backbone(stamp_ns(msg), rows['points'], arrived_ns)
         known = rows['sigma'][np.isfinite(rows['sigma'])]
-        self._log(stamp_ns(msg), scene.values(confidence__published=rows['confidence'][-1], millimetres__tip_sigma=1e3 * rows['sigma'][-1],
-                                              millimetres__sigma=1e3 * float(np.median(known)) if known.size else np.nan))
+        self._log(stamp_ns(msg),
+                  scene.values(confidence__published=rows['confidence'][-1],
+                               millimetres__tip_sigma=1e3 * rows['sigma'][-1],
+                               millimetres__sigma=1e3 * float(np.median(known)) if known.size else np.nan))
 
     def _on_path(self, topic: str, msg, arrived_ns: int) -> None:
         points = path_to_points(msg)
@@ -158,7 +167,8 @@ class NodeView:
         if stamp in self._found and stamp in self._truths:
             errors = compare(self._found[stamp], self._truths[stamp])
             self._log(stamp, scene.truth(self._truths[stamp], self._found[stamp][-1]))
-            self._log(stamp, scene.values(millimetres__tip_error=1e3 * errors.tip, millimetres__error=1e3 * errors.mean))
+            self._log(stamp, scene.values(millimetres__tip_error=1e3 * errors.tip,
+                                          millimetres__error=1e3 * errors.mean))
 
     def _on_tip(self, _, msg, __) -> None:
         p = msg.pose.pose.position
@@ -181,13 +191,16 @@ class NodeView:
 
     def _status(self, status, stamp: int) -> None:
         said = {item.key: item.value for item in status.values}
-        outcome, level = said.get('last outcome', 'none'), status.level[0] if isinstance(status.level, bytes) else status.level
+        outcome, level = (said.get('last outcome', 'none'),
+                          status.level[0] if isinstance(status.level, bytes) else status.level)
         one_pair = 'mask' not in said       # a replay tells of every pair, a node sums up once a second
         if one_pair:
             self._counts[outcome] = self._counts.get(outcome, 0) + 1
         else:
-            self._counts = {key.removeprefix('count '): int(value) for key, value in said.items() if key.startswith('count ') and value.isdecimal()}
-            if self._newest is not None and abs(stamp - self._newest) > MOST_S * 1e9:   # the images have another clock, as those of a bag that is played
+            self._counts = {key.removeprefix('count '): int(value)
+                            for key, value in said.items() if key.startswith('count ') and value.isdecimal()}
+            # the images have another clock, as those of a bag that is played
+            if self._newest is not None and abs(stamp - self._newest) > MOST_S * 1e9:
                 stamp = self._newest + 1
         things = scene.counts(self._counts) | scene.values(milliseconds__node=_number(said.get(LATENCY)))
         if outcome not in ('none', Outcome.OK.value):

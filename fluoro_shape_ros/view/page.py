@@ -1,7 +1,7 @@
 """Rerun's page and its data at one address, and nothing else: what comes from here is told to speak to nobody but here.
 
-By itself the page reports to its makers how it is used and asks other servers for fonts and releases, and older releases of Rerun hand their data to
-whatever page in the same browser asks for it.
+By itself the page reports to its makers how it is used and asks other servers for fonts and releases, and older
+releases of Rerun hand their data to whatever page in the same browser asks for it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from ..cli import ToolError
 
 LOOPBACK = '127.0.0.1'
 PORT = 9090         # unless told otherwise
-POLICY = ("default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "     # WebAssembly, started by a script in the page
+# WebAssembly, started by a script in the page
+POLICY = ("default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
           "frame-ancestors 'none'; form-action 'none'; base-uri 'none'")
 READING = 'Read'    # begins the names of the calls by which data are read; those that change anything are not passed on
 PASSED = 'content-type', 'accept', 'x-grpc-web', 'x-user-agent', 'grpc-timeout'      # headers of such a call
@@ -33,14 +34,16 @@ def address(bind: str, port: int) -> str:
 
 @contextlib.contextmanager
 def serve(bind: str, port: int, page_port: int, data_port: int) -> Iterator[None]:
-    """Serve at `bind` and `port` what Rerun's program serves on this machine at `page_port` and `data_port`. Raises ToolError where that can't be."""
+    """Serve at `bind` and `port` what Rerun's program serves on this machine at `page_port` and `data_port`. Raises
+    ToolError where that can't be."""
     class Handler(_Handler):
         page, data = page_port, data_port
 
     try:
         server = ThreadingHTTPServer((bind, port), Handler)
     except OSError as error:
-        raise ToolError(f'port {port} of {bind} can\'t be used ({error.strerror or error}); see --bind and --port') from error
+        raise ToolError(f'port {port} of {bind} can\'t be used ({error.strerror or error}); '
+                        'see --bind and --port') from error
     server.daemon_threads, server.block_on_close = True, False      # data are read without end
     thread = threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True)
     thread.start()
@@ -78,7 +81,8 @@ class _Handler(BaseHTTPRequestHandler):
         connection = http.client.HTTPConnection(LOOPBACK, port)
         # whoever closes the page, or ends the program, ends it
         with contextlib.closing(connection), contextlib.suppress(OSError, http.client.HTTPException):
-            connection.request(self.command, self.path, body, {name: self.headers[name] for name in PASSED if name in self.headers})
+            connection.request(self.command, self.path, body,
+                               {name: self.headers[name] for name in PASSED if name in self.headers})
             answer = connection.getresponse()
             self.send_response(answer.status)
             for name in ANSWERED:
@@ -95,7 +99,8 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def known(host: str) -> bool:
-    """Whether a Host header names this machine. A name that somebody else can give it (DNS rebinding) would open the data to a page of his."""
+    """Whether a Host header names this machine. A name that somebody else can give it (DNS rebinding) would open the
+    data to a page of his."""
     name = urlsplit(f'//{host}').hostname or ''
     with contextlib.suppress(ValueError):
         return bool(ipaddress.ip_address(name))

@@ -1,4 +1,5 @@
-"""What is in a bag, shown from begin to end: results of a replay, with images where they were copied, or topics of a node as they were recorded."""
+"""What is in a bag, shown from begin to end: results of a replay, with images where they were copied, or topics of a
+node as they were recorded."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ RESULTS = {'backbone_points', 'backbone'}      # either will do
 def namespaces(types: dict[str, str]) -> list[str]:
     """Where results are in a bag, of its topics and their types."""
     found = {topic.rpartition('/')[0] or '/' for topic, kind in types.items()
-             if (topic.endswith('/backbone_points') and kind == CLOUD) or (topic.endswith('/backbone') and kind == PATH and not topic.endswith('ground_truth/backbone'))}
+             if (topic.endswith('/backbone_points') and kind == CLOUD)
+             or (topic.endswith('/backbone') and kind == PATH and not topic.endswith('ground_truth/backbone'))}
     return sorted(found)
 
 
@@ -32,7 +34,8 @@ def topics_of(namespace: str, types: dict[str, str], names: dict[str, str], imag
     for plane in PLANES:
         raw = place(f'plane_{plane}/image_raw')
         if f'plane_{plane}/overlay' not in given.values():      # it shows the image, and more
-            given |= {topic: f'plane_{plane}/image_raw' for topic in (raw, f'{raw}/compressed') if types.get(topic) in IMAGES}
+            given |= {topic: f'plane_{plane}/image_raw' for topic in (raw, f'{raw}/compressed')
+                      if types.get(topic) in IMAGES}
     shown = {topic: name for topic, name in given.items() if images or not name.endswith(('/image_raw', '/overlay'))}
     return shown | {topic: topic for topic, kind in [DIAGNOSTICS] if types.get(topic) == kind}
 

@@ -1,6 +1,7 @@
 """What is shown, as Rerun's archetypes by entity path: pure functions of arrays, nothing of topics or time.
 
-Lengths are in m in the reference frame, but in the close-up of the tip: there they are in mm from it, along the same axes.
+Lengths are in m in the reference frame, but in the close-up of the tip: there they are in mm from it, along the same
+axes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ LINE, THIN, BALL = (rr.Radius.ui_points(width) for width in (2.0, 1.2, 5.0))    
 RING_PX = 10.0              # radius of the ring that shows where the tip is
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 75]
 GREY = '#9aa0a6'
-CURVES = {'confidence': 'confidence', 'millimetres': 'sigma and error, mm', 'milliseconds': 'latency, ms', 'pairs': 'pairs by outcome'}    # plots
+CURVES = {'confidence': 'confidence', 'millimetres': 'sigma and error, mm', 'milliseconds': 'latency, ms',
+          'pairs': 'pairs by outcome'}    # plots
 SERIES = {  # entity -> name in the plot, colour, and whether each value stands for itself
     'confidence/published': ('published', GOOD, True),
     'confidence/refused': ('refused', REJECTED, True),
@@ -47,7 +49,8 @@ OTHERS = ('#ffb347', '#c58bff', '#ff5a5f', '#f2e26b', '#6fa8ff', '#b0b0b0')     
 
 
 def cameras(views: tuple[View, View]) -> Scene:
-    """Sources and detectors of both planes, with the images on them: these are below `plane_a` and `plane_b`, which are pinholes.
+    """Sources and detectors of both planes, with the images on them: these are below `plane_a` and `plane_b`, which are
+    pinholes.
 
     Rerun knows no pinhole that mirrors: the detector of a mirrored image stays empty.
     """
@@ -58,15 +61,18 @@ def cameras(views: tuple[View, View]) -> Scene:
         start, distance = source(view.P), DETECTOR_AT * abs(float(depth(view.P, center)))
         outline = detector(view, distance)
         edges = [outline, *([start, corner] for corner in outline[:4])]
-        scene[f'source_{view.name}'] = rr.Points3D([start], radii=BALL, colors=rgb(SEEN), labels=[f'source {view.name.upper()}'])
+        scene[f'source_{view.name}'] = rr.Points3D([start], radii=BALL, colors=rgb(SEEN),
+                                                   labels=[f'source {view.name.upper()}'])
         scene[f'detector_{view.name}'] = rr.LineStrips3D(edges, radii=THIN, colors=rgb(SEEN))
         if K[0, 0] > 0:
-            scene[f'plane_{view.name}'] = [rr.Pinhole(image_from_camera=K, width=view.width, height=view.height, image_plane_distance=distance), *placed(start, R.T)]
+            scene[f'plane_{view.name}'] = [rr.Pinhole(image_from_camera=K, width=view.width, height=view.height,
+                                                      image_plane_distance=distance), *placed(start, R.T)]
     return scene
 
 
 def placed(origin: np.ndarray, axes: np.ndarray) -> list:
-    """An entity's place: its origin (3,) m and axes (3, 3), the columns, in the reference frame; Rerun is not to draw these axes, for which it has two ways."""
+    """An entity's place: its origin (3,) m and axes (3, 3), the columns, in the reference frame; Rerun is not to draw
+    these axes, for which it has two ways."""
     if hasattr(rr, 'TransformAxes3D'):
         return [rr.Transform3D(translation=origin, mat3x3=axes), rr.TransformAxes3D(0.0)]
     return [rr.Transform3D(translation=origin, mat3x3=axes, axis_length=0.0)]
@@ -87,8 +93,10 @@ def upright(view: View) -> Scene:
 
 
 def picture(plane: str, image: np.ndarray) -> Scene:
-    """An (H, W) uint8 or (H, W, 3) BGR uint8 image of plane 'a' or 'b', as JPEG: a minute of two 1024 x 1024 streams would fill 2 GB else."""
-    return {f'plane_{plane}/picture': rr.EncodedImage(contents=cv2.imencode('.jpg', image, JPEG)[1].tobytes(), media_type='image/jpeg', draw_order=-10.0)}
+    """An (H, W) uint8 or (H, W, 3) BGR uint8 image of plane 'a' or 'b', as JPEG: a minute of two 1024 x 1024 streams
+    would fill 2 GB else."""
+    return {f'plane_{plane}/picture': rr.EncodedImage(contents=cv2.imencode('.jpg', image, JPEG)[1].tobytes(),
+                                                      media_type='image/jpeg', draw_order=-10.0)}
 
 
 # ---- what was found
@@ -96,7 +104,8 @@ def picture(plane: str, image: np.ndarray) -> Scene:
 
 def backbone(points: np.ndarray) -> Scene:
     """(N, 3) backbone, base to tip."""
-    return {'device/backbone': strip(points, LINE, FOUND), 'device/tip': rr.Points3D(points[-1:], radii=BALL, colors=rgb(TIP)),
+    return {'device/backbone': strip(points, LINE, FOUND),
+            'device/tip': rr.Points3D(points[-1:], radii=BALL, colors=rgb(TIP)),
             'tip/backbone': strip(close_up(points, points[-1]), LINE, FOUND)}
 
 
@@ -107,9 +116,11 @@ def ellipsoid(tip: np.ndarray, covariance: np.ndarray) -> Scene:
     variance, axes = np.linalg.eigh(covariance)
     axes[:, 0] *= np.linalg.det(axes)   # a rotation, no mirror
     half = np.sqrt(np.maximum(variance, 0.0) * chdtri(3, 1 - CONFIDENCE))
-    look = dict(quaternions=Rotation.from_matrix(axes).as_quat()[None], colors=rgb(TIP), fill_mode=rr.components.FillMode.MajorWireframe)
+    look = dict(quaternions=Rotation.from_matrix(axes).as_quat()[None], colors=rgb(TIP),
+                fill_mode=rr.components.FillMode.MajorWireframe)
     return {'device/ellipsoid': rr.Ellipsoids3D(centers=[tip], half_sizes=[half], **look),
-            'tip/ellipsoid': rr.Ellipsoids3D(centers=[(0.0, 0.0, 0.0)], half_sizes=[1e3 * half], line_radii=THIN, **look)}
+            'tip/ellipsoid': rr.Ellipsoids3D(centers=[(0.0, 0.0, 0.0)], half_sizes=[1e3 * half],
+                                             line_radii=THIN, **look)}
 
 
 def truth(points: np.ndarray, tip: np.ndarray | None) -> Scene:
@@ -117,7 +128,8 @@ def truth(points: np.ndarray, tip: np.ndarray | None) -> Scene:
     scene = {'truth': strip(points, THIN, GOOD)}
     if tip is not None:
         near = close_up(points, tip)
-        scene |= {'tip/truth': strip(near, LINE, GOOD), 'tip/true_tip': rr.Points3D(near[-1:], radii=BALL, colors=rgb(GOOD))}
+        scene |= {'tip/truth': strip(near, LINE, GOOD),
+                  'tip/true_tip': rr.Points3D(near[-1:], radii=BALL, colors=rgb(GOOD))}
     return scene
 
 
@@ -128,15 +140,19 @@ def drawn(view: View, points: np.ndarray) -> Scene:
 
 def drawn_tip(view: View, tip: np.ndarray, covariance: np.ndarray) -> Scene:
     """A ring around the tip (3,) in the image as received and, where its (3, 3) covariance is known, its ellipse."""
-    shape = Shape(tip[None], np.zeros(1), np.where(np.trace(covariance) > UNKNOWN, np.nan, covariance)[None], np.zeros((1, 2)))
+    shape = Shape(tip[None], np.zeros(1), np.where(np.trace(covariance) > UNKNOWN, np.nan, covariance)[None],
+                  np.zeros((1, 2)))
     turn = np.linspace(0.0, 2 * np.pi, 49)
     ring = distort(view, project(view.P, tip[None])) + RING_PX * np.c_[np.cos(turn), np.sin(turn)]
-    return {f'plane_{view.name}/tip': rr.LineStrips2D([ring, *filter(lambda curve: curve is not None, [tip_ellipse(view, shape)])], radii=THIN, colors=rgb(TIP))}
+    return {f'plane_{view.name}/tip': rr.LineStrips2D([ring, *filter(lambda curve: curve is not None,
+                                                                     [tip_ellipse(view, shape)])], radii=THIN,
+                                                      colors=rgb(TIP))}
 
 
 def nothing() -> Scene:
     """Takes away what was found before: nothing stale stays."""
-    return {path: rr.Clear(recursive=True) for path in ('device', 'tip', 'plane_a/backbone', 'plane_a/tip', 'plane_b/backbone', 'plane_b/tip')}
+    return {path: rr.Clear(recursive=True)
+            for path in ('device', 'tip', 'plane_a/backbone', 'plane_a/tip', 'plane_b/backbone', 'plane_b/tip')}
 
 
 def close_up(points: np.ndarray, tip: np.ndarray) -> np.ndarray:
@@ -176,20 +192,24 @@ def words(text: str, good: bool) -> Scene:
 
 def styles() -> Scene:
     """Names and colours of all lines; they don't change with time."""
-    scene = {path: rr.SeriesPoints(names=name, colors=rgb(colour), marker_sizes=2.5) if single else rr.SeriesLines(names=name, colors=rgb(colour), widths=1.5)
+    scene = {path: rr.SeriesPoints(names=name, colors=rgb(colour), marker_sizes=2.5)
+                   if single else rr.SeriesLines(names=name, colors=rgb(colour), widths=1.5)
              for path, (name, colour, single) in SERIES.items()}
     refused = [outcome.value for outcome in Outcome if outcome is not Outcome.OK]
     colours = {Outcome.OK.value: GOOD} | {name: OTHERS[k % len(OTHERS)] for k, name in enumerate(refused)}
-    return scene | {f'pairs/{name}': rr.SeriesLines(names=name.replace('_', ' '), colors=rgb(colour), widths=1.5) for name, colour in colours.items()}
+    return scene | {f'pairs/{name}': rr.SeriesLines(names=name.replace('_', ' '), colors=rgb(colour), widths=1.5)
+                    for name, colour in colours.items()}
 
 
 # ---- the page
 
 
 def layout(roots: Sequence[str], latency: bool = True) -> rrb.Blueprint:
-    """Where everything is on the page, a tab for each node; `roots` are their entity paths. Without `latency` there is no room for it."""
+    """Where everything is on the page, a tab for each node; `roots` are their entity paths. Without `latency` there is
+    no room for it."""
     nodes = [_of_node(root, latency) for root in roots]
-    return rrb.Blueprint(nodes[0] if len(nodes) == 1 else rrb.Tabs(*nodes), rrb.TimePanel(state='collapsed'), rrb.BlueprintPanel(state='collapsed'),
+    return rrb.Blueprint(nodes[0] if len(nodes) == 1 else rrb.Tabs(*nodes), rrb.TimePanel(state='collapsed'),
+                         rrb.BlueprintPanel(state='collapsed'),
                          rrb.SelectionPanel(state='collapsed'), auto_views=False, auto_layout=False)
 
 
@@ -197,12 +217,16 @@ def _of_node(root: str, latency: bool) -> rrb.Vertical:
     bare = rrb.archetypes.LineGrid3D(visible=False)
     planes = [rrb.Spatial2DView(origin=f'{root}/plane_{plane}', name=f'plane {plane.upper()}') for plane in 'ab']
     space = [
-        rrb.Spatial3DView(origin=root, contents=[f'+ {root}/**', f'- {root}/tip/**'], name='sources, detectors, device', line_grid=bare),
-        rrb.Spatial3DView(origin=root, contents=[f'+ {root}/device/**', f'+ {root}/truth'], name='device (green: truth)', line_grid=bare),
+        rrb.Spatial3DView(origin=root, contents=[f'+ {root}/**', f'- {root}/tip/**'], name='sources, detectors, device',
+                          line_grid=bare),
+        rrb.Spatial3DView(origin=root, contents=[f'+ {root}/device/**', f'+ {root}/truth'],
+                          name='device (green: truth)', line_grid=bare),
         rrb.Spatial3DView(origin=f'{root}/tip', name=f'tip, {CONFIDENCE:.0%} ellipsoid, mm', line_grid=bare)]
     axes = {'confidence': rrb.ScalarAxis(range=(-0.05, 1.05))}
-    plots = [rrb.TimeSeriesView(origin=f'{root}/{what}', name=name, plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftBottom if what == 'confidence' else rrb.Corner2D.LeftTop),
+    plots = [rrb.TimeSeriesView(origin=f'{root}/{what}', name=name, plot_legend=rrb.PlotLegend(
+        rrb.Corner2D.LeftBottom if what == 'confidence' else rrb.Corner2D.LeftTop),
                                 axis_y=axes.get(what))
              for what, name in CURVES.items() if latency or what != 'milliseconds']
-    return rrb.Vertical(rrb.Horizontal(rrb.Vertical(*planes), rrb.Vertical(*space), rrb.Vertical(*plots), column_shares=[4, 4, 4]),
+    return rrb.Vertical(rrb.Horizontal(rrb.Vertical(*planes), rrb.Vertical(*space), rrb.Vertical(*plots),
+                                       column_shares=[4, 4, 4]),
                         rrb.TextLogView(origin=f'{root}/log', name='outcomes'), row_shares=[6, 1], name=root)

@@ -23,18 +23,22 @@ STOP_S = 5.0        # to end
 
 @contextlib.contextmanager
 def viewer(data_port: int, page_port: int | None) -> Iterator[subprocess.Popen]:
-    """The program, for as long as the block lasts; without a `page_port` it draws in a window. It listens on this machine alone.
+    """The program, for as long as the block lasts; without a `page_port` it draws in a window. It listens on this
+    machine alone.
 
     Raises ToolError where it does not come up.
     """
-    options = ['--expect-data-soon', '--hide-welcome-screen'] if page_port is None else ['--serve-web', '--web-viewer-port', str(page_port)]
+    options = (['--expect-data-soon', '--hide-welcome-screen']
+               if page_port is None else ['--serve-web', '--web-viewer-port', str(page_port)])
     with tempfile.TemporaryDirectory() as folder:
         forbid_statistics(Path(folder))
         log = Path(folder) / 'log.txt'
         with log.open('w') as output:
             # in a process group of its own: Python's wrapper starts the real one
-            process = subprocess.Popen([sys.executable, '-m', 'rerun_cli', *options, '--bind', LOOPBACK, '--port', str(data_port)], process_group=0,
-                                       stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, env={**os.environ, 'XDG_CONFIG_HOME': folder})
+            process = subprocess.Popen([sys.executable, '-m', 'rerun_cli', *options, '--bind', LOOPBACK, '--port',
+                                        str(data_port)], process_group=0,
+                                       stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                                       env={**os.environ, 'XDG_CONFIG_HOME': folder})
         try:
             _wait(process, [port for port in (data_port, page_port) if port is not None], log)
             yield process
@@ -45,7 +49,8 @@ def viewer(data_port: int, page_port: int | None) -> Iterator[subprocess.Popen]:
 def forbid_statistics(folder: Path) -> None:
     """Rerun reports how it is used unless its configuration, here one of its own in `folder`, says otherwise."""
     (folder / 'rerun').mkdir()
-    (folder / 'rerun' / 'analytics.json').write_text(json.dumps({'analytics_enabled': False, 'analytics_id': '', 'metadata': {}}))
+    (folder / 'rerun' / 'analytics.json').write_text(json.dumps({'analytics_enabled': False, 'analytics_id': '',
+                                                                 'metadata': {}}))
 
 
 def free_port() -> int:

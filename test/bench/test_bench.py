@@ -31,8 +31,8 @@ def found(mean_mm, tip_mm, surprise=float('nan'), seed=0):
     return Answer(seed, Outcome.OK, errors=errors(mean_mm, tip_mm), surprise=surprise)
 
 
-GIVEN = [found(0.1, 0.5, 1.0), found(0.3, 1.0, 7.8), found(0.32, 0.1, 7.9), found(0.1, 1.1), found(1.2, 0.1), found(0.1, 2.5),
-         Answer(6, Outcome.CURVATURE), Answer(7, Outcome.CURVATURE), Answer(8, Outcome.LENGTH)]
+GIVEN = [found(0.1, 0.5, 1.0), found(0.3, 1.0, 7.8), found(0.32, 0.1, 7.9), found(0.1, 1.1), found(1.2, 0.1),
+         found(0.1, 2.5), Answer(6, Outcome.CURVATURE), Answer(7, Outcome.CURVATURE), Answer(8, Outcome.LENGTH)]
 
 
 def test_row_counts_what_is_good_wrong_and_honest():
@@ -40,7 +40,8 @@ def test_row_counts_what_is_good_wrong_and_honest():
     assert (row.scenes, row.answered, row.within, row.silent, row.reported, row.honest) == (9, 6, 2, 2, 3, 2)
     assert row.rejections == {'curvature_too_high': 2, 'length_out_of_bounds': 1}
     assert_allclose([row.errors['mean'].mean, row.errors['mean'].worst], [2.12e-3 / 6, 1.2e-3])
-    assert_allclose(row.errors['tip'].p95, 2.5e-3 - 0.25 * 1.4e-3)        # a quarter of a place below the last of six: 1.1, 2.5
+    # a quarter of a place below the last of six: 1.1, 2.5
+    assert_allclose(row.errors['tip'].p95, 2.5e-3 - 0.25 * 1.4e-3)
 
 
 def test_where_no_device_is_every_shape_is_a_silent_failure():
@@ -49,9 +50,11 @@ def test_where_no_device_is_every_shape_is_a_silent_failure():
 
 
 def test_table_has_a_line_a_family_and_method():
-    trials = [Trial(Task('p', k, ('spline', 'paper')), {'spline': answer, 'paper': Answer(k, Outcome.NO_DEVICE_A)}, Bound(2e-5, 1e-4, 9e-5))
+    trials = [Trial(Task('p', k, ('spline', 'paper')), {'spline': answer, 'paper': Answer(k, Outcome.NO_DEVICE_A)},
+                    Bound(2e-5, 1e-4, 9e-5))
               for k, answer in enumerate(GIVEN)]
-    trials.append(Trial(Task('blank', 0, ('spline', 'paper')), {m: Answer(0, Outcome.NO_DEVICE_B, device=False) for m in ('spline', 'paper')}, None))
+    trials.append(Trial(Task('blank', 0, ('spline', 'paper')),
+                        {m: Answer(0, Outcome.NO_DEVICE_B, device=False) for m in ('spline', 'paper')}, None))
     lines = table.table(table.rows(trials)).splitlines()
     assert max(map(len, lines)) < 140
     shares, errors_mm = lines[1:5], [line.split() for line in lines[7:9]]
@@ -60,7 +63,8 @@ def test_table_has_a_line_a_family_and_method():
     assert shares[2].split() == 'blank spline 1 0 % - 0 - 1 no_device_in_plane_b'.split()
     assert errors_mm[0][:5] == ['p', 'spline', '0.353', '0.980', '1.200']
     assert errors_mm[1] == ['bound', *['0.020'] * 3, '-', *['0.100'] * 3, *['0.090'] * 3, '-']
-    assert lines[-2:] == ['spline: 2 silent failures in 10 scenes (20.0 %)', 'paper: 0 silent failures in 10 scenes (0.0 %)']
+    assert lines[-2:] == ['spline: 2 silent failures in 10 scenes (20.0 %)',
+                          'paper: 0 silent failures in 10 scenes (0.0 %)']
 
 
 def test_plot_shows_silent_failures_in_their_colour(tmp_path):
@@ -69,7 +73,8 @@ def test_plot_shows_silent_failures_in_their_colour(tmp_path):
 
     def red_pixels(answers):
         file = tmp_path / 'bench.png'
-        plot.draw([Trial(Task('p', k, ('spline',)), {'spline': a}, Bound(2e-5, 1e-4, 9e-5)) for k, a in enumerate(answers)], file)
+        plot.draw([Trial(Task('p', k, ('spline',)), {'spline': a}, Bound(2e-5, 1e-4, 9e-5))
+                   for k, a in enumerate(answers)], file)
         image = cv2.imread(str(file)).astype(int)
         assert image.shape[1] == 1500 and image.std() > 5
         return (np.abs(image - [0x5f, 0x5a, 0xff]).max(axis=2) < 3).sum()
@@ -85,7 +90,8 @@ class Canned:
 
     def __call__(self, frame, config, prior):
         self.config, self.prior = config, prior
-        return Reconstruction(Outcome.OK, 'ok', self.shape) if self.shape else Reconstruction(Outcome.LENGTH, 'too long')
+        return (Reconstruction(Outcome.OK, 'ok', self.shape)
+                if self.shape else Reconstruction(Outcome.LENGTH, 'too long'))
 
 
 def case(**options):
@@ -97,7 +103,8 @@ def test_answer_gives_what_a_user_knows_and_measures_what_comes(monkeypatch):
     masks = (np.ones((320, 320), np.float32),) * 2
     given = case(masks=masks, note='a note')
     truth, n = given.scene.truth, len(given.scene.truth)
-    shape = Shape(truth + [0, 0, 1e-3], np.linspace(0, 0.1, n), np.broadcast_to(np.eye(3) * 0.25e-6, (n, 3, 3)), np.zeros((n, 2)))
+    shape = Shape(truth + [0, 0, 1e-3], np.linspace(0, 0.1, n), np.broadcast_to(np.eye(3) * 0.25e-6, (n, 3, 3)),
+                  np.zeros((n, 2)))
     monkeypatch.setattr(trial, 'reconstruct', pipeline := Canned(shape))
     answer = trial.answer(given, Config())
     assert pipeline.prior.masks is masks and pipeline.config.detection.robot_radius == 0.001
@@ -113,7 +120,8 @@ def test_answer_gives_what_a_user_knows_and_measures_what_comes(monkeypatch):
 def test_accuracy_is_written_as_json_and_does_not_depend_on_the_number_of_jobs(tmp_path, capfd):
     def run(jobs):
         file = tmp_path / f'{jobs}.json'
-        assert main.main(['accuracy', '--families', 'p_xray', '--methods', 'spline', '--scenes', '2', '--first-seed', '7', '--jobs', str(jobs),
+        assert main.main(['accuracy', '--families', 'p_xray', '--methods', 'spline', '--scenes', '2', '--first-seed',
+                          '7', '--jobs', str(jobs),
                            '--json', str(file)]) == 0
         return file.read_text(), capfd.readouterr().out
 
@@ -150,7 +158,8 @@ def test_what_cannot_be_benched_is_named_at_once(arguments, code, word, capsys):
 
 def test_help_names_all_families():
     for command, group in (('accuracy', families.ACCURACY), ('robustness', families.ROBUSTNESS)):
-        text = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', command, '--help'], capture_output=True, text=True, check=True).stdout
+        text = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', command, '--help'],
+                              capture_output=True, text=True, check=True).stdout
         assert all(f'  {name} ' in text for name in group)
 
 
@@ -174,7 +183,8 @@ def test_tangent_device_turns_back_among_the_epipolar_planes(seed):
 def test_crossing_device_meets_itself_in_an_image(seed):
     points = scenes.xray_run(seed, views=SMALL, anatomy=False, kind='crossing', lengths=families.LONG).backbone()[::5]
     apart = np.abs(np.subtract.outer(np.arange(len(points)), np.arange(len(points)))) * 0.5e-3
-    nearest = [np.linalg.norm(uv[:, None] - uv[None], axis=2)[apart > 0.02].min() for uv in (project(v.P, points) for v in SMALL)]
+    nearest = [np.linalg.norm(uv[:, None] - uv[None], axis=2)[apart > 0.02].min()
+               for uv in (project(v.P, points) for v in SMALL)]
     assert min(nearest) < 0.4       # px, of steps of half a pixel
 
 
@@ -200,7 +210,8 @@ def test_calibration_is_off_by_half_a_pixel_and_nothing_else():
     assert_allclose(np.linalg.norm(off[1], axis=1), 0.5)
 
 
-@pytest.mark.parametrize('name, seed, planes', [('blank', 0, ()), ('one_plane', 0, (0,)), ('one_plane', 1, (1,)), ('p_xray', 0, (0, 1))])
+@pytest.mark.parametrize('name, seed, planes', [('blank', 0, ()), ('one_plane', 0, (0,)), ('one_plane', 1, (1,)),
+                                                ('p_xray', 0, (0, 1))])
 def test_device_is_seen_in_the_planes_it_should_be_seen_in(name, seed, planes):
     family = families.families()[name]
     scene = family.make(seed).scene
@@ -230,7 +241,8 @@ def real(tmp_path):
         cv2.imwrite(str(tmp_path / f'background_plane_{view.name}.png'), image)
         K, R, t = decompose(view.P)
         biased = K + np.array([[0, 0, 50.0], [0, 0, 0], [0, 0, 0]])
-        calibration[f'plane_{view.name}'] = dict(K=biased.tolist(), K_corrected=K.tolist(), R=R.tolist(), t=(t + R @ [0.3, -0.2, 0.1]).tolist())
+        calibration[f'plane_{view.name}'] = dict(K=biased.tolist(), K_corrected=K.tolist(), R=R.tolist(),
+                                                 t=(t + R @ [0.3, -0.2, 0.1]).tolist())
     (tmp_path / 'calibration.json').write_text(json.dumps(calibration))
     return tmp_path
 
@@ -266,10 +278,12 @@ def test_bad_folders_are_named(real, tmp_path_factory):
 
 def test_speed_is_printed_full_and_tracked_and_written(tmp_path, capsys):
     file = tmp_path / 'speed.json'
-    assert main.main(['speed', '--sizes', '1024', '--scenes', '2', '--first-seed', '5', '--rounds', '1', '--alone', '--json', str(file)]) == 0
+    assert main.main(['speed', '--sizes', '1024', '--scenes', '2', '--first-seed', '5', '--rounds', '1', '--alone',
+                      '--json', str(file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line[7:24].strip() for line in lines[1:3]] == ['spline, full', 'spline, tracked']
-    assert any('spline, full: search' in line for line in lines) and any('spline, tracked: track' in line for line in lines)
+    assert (any('spline, full: search' in line for line in lines)
+            and any('spline, tracked: track' in line for line in lines))
     full, tracked = json.loads(file.read_text())['laps']
     for laps in (full, tracked):
         assert 0 < laps['right'] == len(laps['seconds']) <= 2 and len(laps['yardsticks']) == laps['right']
@@ -278,8 +292,10 @@ def test_speed_is_printed_full_and_tracked_and_written(tmp_path, capsys):
 
 
 def test_growth_is_of_the_cost_per_pixel_in_yardsticks():
-    """Twice the width is four times the pixels: 8 Y instead of 2 Y is as much a pixel, whatever Y was just then; 16 Y is twice as much."""
-    small, same, more = (speed.Laps(size, speed.SPLINE, seconds=[s], yardsticks=[y], cpu=[s]) for size, s, y in ((512, 2.0, 1.0), (1024, 24.0, 3.0), (1024, 16.0, 1.0)))
+    """Twice the width is four times the pixels: 8 Y instead of 2 Y is as much a pixel, whatever Y was just then; 16 Y
+    is twice as much."""
+    small, same, more = (speed.Laps(size, speed.SPLINE, seconds=[s], yardsticks=[y], cpu=[s])
+                         for size, s, y in ((512, 2.0, 1.0), (1024, 24.0, 3.0), (1024, 16.0, 1.0)))
     found = [small, same, more]
     assert_allclose([speed.growth(laps, found) for laps in found], [1, 1, 2])
     assert_allclose(small.ns_per_pixel, 1e9 / 512**2)

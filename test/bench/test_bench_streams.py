@@ -27,8 +27,10 @@ def pair(letter, seconds=0.1, off_mm=0.0, stray_mm=0.0):
     """One of MEANT; - refused, d dark and refused, D dark and published."""
     shown, published = letter not in 'dD', letter not in '-d'
     errors = Errors(MEANT[letter][0] / 1e3, 0.0, 0.0, MEANT[letter][1] / 1e3, 0.0, 0.0) if letter in MEANT else None
-    answer = Answer(0, Outcome.OK if published else Outcome.LOW_CONFIDENCE if shown else Outcome.NO_DEVICE_B, shown, errors)
-    return Pair(answer, seconds, np.array([off_mm, 0.0, 0.0]) / 1e3 if published else None, stray_mm / 1e3 if published else math.nan)
+    answer = Answer(0, Outcome.OK if published else Outcome.LOW_CONFIDENCE if shown else Outcome.NO_DEVICE_B,
+                    shown, errors)
+    return Pair(answer, seconds, np.array([off_mm, 0.0, 0.0]) / 1e3 if published else None,
+                stray_mm / 1e3 if published else math.nan)
 
 
 def pairs(letters):
@@ -54,7 +56,8 @@ def pairs(letters):
 ])
 def test_found_gap_and_recovery(letters, found, gap, recoveries):
     given = pairs(letters)
-    assert (stream_figures.found(given), stream_figures.gap(given), stream_figures.recoveries(given)) == (found, gap, recoveries)
+    assert ((stream_figures.found(given), stream_figures.gap(given), stream_figures.recoveries(given))
+            == (found, gap, recoveries))
 
 
 @pytest.mark.parametrize('off_mm, stray_mm, jumps', [
@@ -68,7 +71,8 @@ def test_found_gap_and_recovery(letters, found, gap, recoveries):
 def test_jumps(off_mm, stray_mm, jumps):
     given = [pair('r', off_mm=o, stray_mm=s) for o, s in zip(off_mm, stray_mm)]
     assert stream_figures.jumps(given) == jumps
-    assert stream_figures.jumps([given[0], *pairs('--d'), *given[1:]]) == jumps      # from one answer to the next, whatever lies between
+    # from one answer to the next, whatever lies between
+    assert stream_figures.jumps([given[0], *pairs('--d'), *given[1:]]) == jumps
 
 
 def test_a_dark_pair_that_is_answered_is_silent():
@@ -80,12 +84,14 @@ def test_rows_and_table():
     """Times are 1 ms ... 10 ms of ten pairs: their median is 5.5 ms, p95 9.55 ms, p99 9.91 ms."""
     one = [dataclasses.replace(p, seconds=(k + 1) / 1000) for k, p in enumerate(pairs('-rr-nsddrr'))]
     r = stream_figures.row([one])
-    assert (r.streams, r.pairs, r.shown, r.answered, r.right, r.silent, r.found, r.since, r.right_since) == (1, 10, 8, 6, 4, 1, 1, 7, 4)
+    assert ((r.streams, r.pairs, r.shown, r.answered, r.right, r.silent, r.found, r.since, r.right_since)
+            == (1, 10, 8, 6, 4, 1, 1, 7, 4))
     assert (r.gap, r.back, r.again, r.pairs_to_recover, r.rejections) == (1, 1, 1, 1, {'confidence_too_low': 2})
     np.testing.assert_allclose((r.median, r.p95, r.p99, r.worst), (0.0055, 0.00955, 0.00991, 0.010))
     rows = stream_figures.rows([('plain', one), ('dark', pairs('----')), ('plain', pairs('rr'))])
     assert list(rows) == ['plain', 'dark', 'total']
-    assert (rows['plain'].streams, rows['total'].streams, rows['total'].pairs, rows['total'].gap, rows['dark'].found) == (2, 3, 16, 4, 0)
+    assert ((rows['plain'].streams, rows['total'].streams, rows['total'].pairs, rows['total'].gap, rows['dark'].found)
+            == (2, 3, 16, 4, 0))
     lines = stream_figures.table(rows).splitlines()
     assert lines[1].split('|')[0].split() == 'plain 2 12 10 80.0 % 60.0 % 1 2 66.7 % 1 1 of 1 1 0'.split()
     assert lines[2].split() == 'dark 1 4 4 0.0 % 0.0 % 0 0 - 4 - - 0 | 100 100 100 100 | 4 confidence_too_low'.split()
@@ -102,7 +108,8 @@ def stream():
 
 
 def given(stream):
-    return Config.from_values(robot_radius=stream.run.radius, base_position=stream.backbone(0.0)[0].tolist(), min_confidence=0.0)
+    return Config.from_values(robot_radius=stream.run.radius, base_position=stream.backbone(0.0)[0].tolist(),
+                              min_confidence=0.0)
 
 
 def test_pairs_go_through_the_memory_of_the_node(stream):
@@ -142,7 +149,8 @@ def test_a_stale_mask_is_taken_before_the_first_pair():
 def test_command_line(tmp_path, capsys):
     """A table, JSON and a sheet; the answers are those of the same task in this process."""
     file = tmp_path / 'streams.json'
-    words = ['streams', '--streams', '1', '--pairs', '2', '--kinds', 'plain', '--first-seed', str(SEED), '--jobs', '1', '--pictures', '1', '--sheets', str(tmp_path / 'sheets')]
+    words = ['streams', '--streams', '1', '--pairs', '2', '--kinds', 'plain', '--first-seed', str(SEED), '--jobs', '1',
+             '--pictures', '1', '--sheets', str(tmp_path / 'sheets')]
     assert main.main([*words, '--json', str(file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split()[:4] == ['plain', '1', '2', '2'] and 'budget    none' in lines[-1]
@@ -151,7 +159,8 @@ def test_command_line(tmp_path, capsys):
     here = streams.plain(streams.attempt(streams.Task(SEED, 'plain', 2)))
     for p, q in zip(here['pairs'], written['streams'][0]['pairs'], strict=True):
         assert (p['outcome'], p['shown'], p['right']) == (q['outcome'], q['shown'], q['right'])
-        np.testing.assert_allclose(p['tip_off_m'], q['tip_off_m'], atol=1e-6)       # libraries of more than one thread round otherwise
+        # libraries of more than one thread round otherwise
+        np.testing.assert_allclose(p['tip_off_m'], q['tip_off_m'], atol=1e-6)
     assert [f.name for f in (tmp_path / 'sheets').iterdir()] == [f'plain_{SEED}_0.png']
 
 

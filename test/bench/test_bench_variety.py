@@ -1,4 +1,5 @@
-"""The bench on varied scenes: its counts, table and sheets by hand, scenes from elsewhere from a folder, and the whole through its command line."""
+"""The bench on varied scenes: its counts, table and sheets by hand, scenes from elsewhere from a folder, and the whole
+through its command line."""
 
 import json
 import math
@@ -26,7 +27,8 @@ REFUSED = Answer(0, Outcome.LENGTH, cpu_s=0.5)
 
 
 def drawn(seed):
-    """A scene that takes hundredths of a second; so few px of a device are found, but not believed with the usual confidence."""
+    """A scene that takes hundredths of a second; so few px of a device are found, but not believed with the usual
+    confidence."""
     return scenes.xray_run(seed, views=SMALL, lengths=(0.067, 0.1), anatomy=False, radius=0.001).scene()
 
 
@@ -36,7 +38,8 @@ def save(folder, scene, **changes):
     for name, image in zip(open_scenes.IMAGES, scene.frame.images):
         cv2.imwrite(str(folder / name), image)
     a, b = scene.frame.views
-    about = dict(family='rod', device=True, P_a=a.P.tolist(), P_b=b.P.tolist(), radius_m=scene.radius, backbone_m=scene.truth.tolist(), entering=False) | changes
+    about = dict(family='rod', device=True, P_a=a.P.tolist(), P_b=b.P.tolist(), radius_m=scene.radius,
+                 backbone_m=scene.truth.tolist(), entering=False) | changes
     (folder / 'scene.json').write_text(json.dumps({name: value for name, value in about.items() if value is not None}))
 
 
@@ -54,7 +57,8 @@ def folder(tmp_path):
         save(tmp_path / 'scenes' / f'rod_{seed}', drawn(seed))
     hide(tmp_path / 'scenes' / 'rod_2')
     blank = scenes.xray_run(9, views=SMALL, lengths=(0.067, 0.1), anatomy=False)
-    save(tmp_path / 'scenes' / 'none_0', replace(blank.scene(), frame=blank.without_device()), family='none', device=False, backbone_m=[])
+    save(tmp_path / 'scenes' / 'none_0', replace(blank.scene(), frame=blank.without_device()), family='none',
+         device=False, backbone_m=[])
     return tmp_path / 'scenes'
 
 
@@ -79,7 +83,8 @@ def test_a_refusal_is_not_right_and_old_limits_stay():
 
 
 def test_pixels_are_those_at_the_device():
-    """At the isocentre 1 mm, 81 cm from the source; 81 mm towards source a a tenth less for plane a, and the same for b."""
+    """At the isocentre 1 mm, 81 cm from the source; 81 mm towards source a a tenth less for plane a,
+    and the same for b."""
     scene = drawn(0)
     towards_a = -SMALL[0].P[2, :3] * 0.081
     assert_allclose(trial.pixel_size(replace(scene, truth=np.zeros((3, 3)))), 1e-3)
@@ -87,8 +92,9 @@ def test_pixels_are_those_at_the_device():
     assert math.isnan(trial.pixel_size(replace(scene, truth=np.empty((0, 3)))))
 
 
-GIVEN = [found(0.1, 0.1, kind='rod', cpu_s=0.1, surprise=1.0), found(0.1, 2.5, kind='tube', cpu_s=0.3, surprise=9.0), found(0.5, 0.5, kind='rod', cpu_s=0.2),
-         replace(REFUSED, kind='rod'), replace(REFUSED, kind='tube', cpu_s=0.9), Answer(0, Outcome.NO_DEVICE_A, False, kind='tube', cpu_s=0.6)]
+GIVEN = [found(0.1, 0.1, kind='rod', cpu_s=0.1, surprise=1.0), found(0.1, 2.5, kind='tube', cpu_s=0.3, surprise=9.0),
+         found(0.5, 0.5, kind='rod', cpu_s=0.2), replace(REFUSED, kind='rod'), replace(REFUSED, kind='tube', cpu_s=0.9),
+         Answer(0, Outcome.NO_DEVICE_A, False, kind='tube', cpu_s=0.6)]
 TRIALS = [Trial(Task('devices', 3 + k, ('spline',)), {'spline': a}, None) for k, a in enumerate(GIVEN)]
 
 
@@ -104,11 +110,14 @@ def test_table_has_kinds_below_their_family():
     other = Trial(Task('wide', 0, ('spline',)), {'spline': found(0.1, 0.1, cpu_s=0.4)}, None)
     lines = variety.table([*TRIALS, other]).splitlines()
     assert max(map(len, lines)) < 140
-    assert lines[2].split() == 'devices spline 6 50 % 20 % 1 50 % 0.20 0.30 0.60 0.90 2 length_out_of_bounds, 1 no_device_in_plane_a'.split()
+    assert (lines[2].split() == 'devices spline 6 50 % 20 % 1 50 % 0.20 0.30 0.60 0.90 2 length_out_of_bounds, '
+                                '1 no_device_in_plane_a'.split())
     assert lines[3].split() == 'rod 3 67 % 33 % 0 100 % 0.15 0.20 0.50 0.50 1 length_out_of_bounds'.split()
-    assert lines[4].split() == 'tube 3 33 % 0 % 1 0 % 0.30 0.30 0.75 0.90 1 length_out_of_bounds, 1 no_device_in_plane_a'.split()
+    assert (lines[4].split() == 'tube 3 33 % 0 % 1 0 % 0.30 0.30 0.75 0.90 1 length_out_of_bounds, '
+                                '1 no_device_in_plane_a'.split())
     assert lines[5].split() == 'wide spline 1 100 % 100 % 0 - 0.40 0.40 - -'.split()
-    assert lines[-1] == 'spline: 2 of 6 devices right (33 %), 1 silent failures in 7 scenes (14.3 %), CPU 0.40 s a pair, 0.90 s at worst'
+    assert (lines[-1] == 'spline: 2 of 6 devices right (33 %), 1 silent failures in 7 scenes (14.3 %), '
+                         'CPU 0.40 s a pair, 0.90 s at worst')
     columns = [line.index('rod') for line in lines if 'rod' in line]
     assert columns == [2] and lines[2].startswith('devices')
 
@@ -122,13 +131,16 @@ def test_every_method_has_lines_of_its_own():
 
 def test_trials_are_plain_for_json():
     plain = variety.plain_trial(TRIALS[1])
-    assert (plain['family'], plain['seed'], plain['kind'], plain['device'], plain['px_m']) == ('devices', 4, 'tube', True, None)
+    assert ((plain['family'], plain['seed'], plain['kind'], plain['device'], plain['px_m'])
+            == ('devices', 4, 'tube', True, None))
     answer = plain['answers']['spline']
-    assert (answer['outcome'], answer['right'], answer['silent_failure'], answer['cpu_s'], answer['surprise']) == ('ok', False, True, 0.3, 9.0)
+    assert ((answer['outcome'], answer['right'], answer['silent_failure'], answer['cpu_s'], answer['surprise'])
+            == ('ok', False, True, 0.3, 9.0))
     assert_allclose(answer['errors_m']['tip'], 2.5e-3)
     assert answer['confidence'] is None
     sure = Trial(TRIALS[1].task, {'spline': replace(GIVEN[1], confidence=0.998)}, None)
-    assert variety.plain_trial(sure)['answers']['spline']['confidence'] == 0.998 and variety.plain([sure]) == variety.plain(TRIALS[1:2])
+    assert (variety.plain_trial(sure)['answers']['spline']['confidence'] == 0.998
+            and variety.plain([sure]) == variety.plain(TRIALS[1:2]))
     assert json.loads(json.dumps(variety.plain(TRIALS), allow_nan=False))['devices/spline/rod']['scenes'] == 3
 
 
@@ -161,15 +173,17 @@ def test_radius_is_given_off_and_the_base_kept_back(pipeline):
 
 
 @pytest.mark.parametrize('of_family, of_case, device', [(True, True, True), (True, False, False), (False, True, False)])
-def test_a_case_without_a_device_is_one_and_so_are_all_of_a_family_without(monkeypatch, pipeline, of_family, of_case, device):
+def test_a_case_without_a_device_is_one_and_so_are_all_of_a_family_without(monkeypatch, pipeline, of_family,
+                                                                           of_case, device):
     family = Family('', lambda seed: Case(drawn(seed), device=of_case), device=of_family)
     monkeypatch.setattr(trial, 'varied', lambda sources: {'some': family})
     assert trial.attempt(Task('some', 0, ('spline',), sources=families.Sources())).answers['spline'].device == device
 
 
 @pytest.mark.parametrize('wanted, outcome, taken', [
-    ('', Outcome.OK, False), ('all', Outcome.LENGTH, True), ('refused', Outcome.LENGTH, True), ('refused', Outcome.OK, False),
-    ('answered', Outcome.OK, True), ('answered', Outcome.LENGTH, False), ('silent', Outcome.OK, True), ('silent', Outcome.LENGTH, False),
+    ('', Outcome.OK, False), ('all', Outcome.LENGTH, True), ('refused', Outcome.LENGTH, True),
+    ('refused', Outcome.OK, False), ('answered', Outcome.OK, True), ('answered', Outcome.LENGTH, False),
+    ('silent', Outcome.OK, True), ('silent', Outcome.LENGTH, False),
 ])
 def test_pictures_are_taken_of_what_is_asked_for(monkeypatch, wanted, outcome, taken):
     family = Family('', lambda seed: Case(drawn(seed)), device=False)       # so that what is published is wrong
@@ -187,7 +201,8 @@ def test_what_cannot_be_drawn_or_given_is_named(monkeypatch):
             raise ImportError('no renderer')
         return Case(replace(drawn(0), radius=0.019))
     monkeypatch.setattr(trial, 'varied', lambda sources: {'some': Family('', make)})
-    for seed, error, words in ((1, 0.0, 'some, seed 1: no such shape'), (2, 0.0, 'some, seed 2: no renderer'), (0, 0.5, 'some, seed 0: robot_radius')):
+    for seed, error, words in ((1, 0.0, 'some, seed 1: no such shape'), (2, 0.0, 'some, seed 2: no renderer'),
+                               (0, 0.5, 'some, seed 0: robot_radius')):
         with pytest.raises(ToolError, match=words):
             trial.attempt(Task('some', seed, ('spline',), sources=families.Sources(), radius_error=error))
 
@@ -203,10 +218,12 @@ def test_counted_families_are_tried_from_their_first_scene():
 def test_scenes_from_elsewhere_are_read_in_order_of_name(folder):
     family = open_scenes.open_family(folder)
     cases = [family.make(seed) for seed in range(family.count)]
-    assert [(c.note, c.kind, c.device) for c in cases] == [('none_0', 'none', False), *((f'rod_{k}', 'rod', True) for k in range(3))]
+    assert [(c.note, c.kind, c.device) for c in cases] == [('none_0', 'none', False),
+                                                           *((f'rod_{k}', 'rod', True) for k in range(3))]
     blank, rod, original = cases[0].scene, cases[2].scene, drawn(1)
     assert blank.truth.shape == (0, 3) and blank.base_position.tolist() == []
-    for read, image, view, expected in zip(rod.frame.images, original.frame.images, rod.frame.views, original.frame.views):
+    for read, image, view, expected in zip(rod.frame.images, original.frame.images, rod.frame.views,
+                                           original.frame.views):
         np.testing.assert_array_equal(read, image)
         assert_allclose(view.P, expected.P)
         assert (view.width, view.height) == (320, 320)
@@ -230,17 +247,20 @@ def test_without_a_truth_no_base_is_given(folder, pipeline):
 
 
 @pytest.mark.parametrize('changes, words', [
-    ({'P_b': None}, 'P_b is missing'), ({'P_a': [[1, 2], [3, 4]]}, 'not 3x4'), ({'P_a': 'wide'}, 'P_a is not made of finite numbers'),
-    ({'P_a': [[0, 0, 0, 0]] * 3}, 'zero or singular'), ({'P_b': [[1, 2], [3]]}, 'P_b is not'), ({'radius_m': -1}, 'radius_m is -1'), ({'radius_m': [1, 2]}, 'radius_m'),
-    ({'radius_m': math.nan}, 'radius_m'), ({'backbone_m': []}, 'less than two points'), ({'backbone_m': [[1, 2]]}, 'backbone_m must be N x 3, got 1 x 2'),
-    ({'backbone_m': 3}, 'backbone_m must be N x 3'), ({'backbone_m': [[0, 0, math.inf], [0, 0, 1]]}, 'backbone_m is not made of finite'), ({'device': 'yes'}, 'device must be'),
-    ({'family': None}, 'family is missing'),
+    ({'P_b': None}, 'P_b is missing'), ({'P_a': [[1, 2], [3, 4]]}, 'not 3x4'),
+    ({'P_a': 'wide'}, 'P_a is not made of finite numbers'), ({'P_a': [[0, 0, 0, 0]] * 3}, 'zero or singular'),
+    ({'P_b': [[1, 2], [3]]}, 'P_b is not'), ({'radius_m': -1}, 'radius_m is -1'), ({'radius_m': [1, 2]}, 'radius_m'),
+    ({'radius_m': math.nan}, 'radius_m'), ({'backbone_m': []}, 'less than two points'),
+    ({'backbone_m': [[1, 2]]}, 'backbone_m must be N x 3, got 1 x 2'), ({'backbone_m': 3}, 'backbone_m must be N x 3'),
+    ({'backbone_m': [[0, 0, math.inf], [0, 0, 1]]}, 'backbone_m is not made of finite'),
+    ({'device': 'yes'}, 'device must be'), ({'family': None}, 'family is missing'),
 ])
 def test_a_bad_description_is_named(tmp_path, changes, words):
     save(tmp_path / 'one', drawn(0), **changes)
     with pytest.raises(ToolError) as error:
         open_scenes.open_case(tmp_path / 'one')
-    assert str(tmp_path / 'one' / 'scene.json') in str(error.value) and words in str(error.value) and '\n' not in str(error.value)
+    assert (str(tmp_path / 'one' / 'scene.json') in str(error.value) and words in str(error.value)
+            and '\n' not in str(error.value))
 
 
 @pytest.mark.parametrize('text', ['', '{"P_a": ', '[]', '7', 'null', '\x00', '"text"'])
@@ -271,12 +291,13 @@ def test_bad_folders_and_images_are_named(tmp_path):
 
 
 def test_a_thumbnail_is_stretched_between_its_percentiles():
-    """A ramp of 1000 columns from 2000 to 2999, at 0.4 of its size: black to the 0.5th percentile, 2005, and white from the 99.5th, 2994."""
+    """A ramp of 1000 columns from 2000 to 2999, at 0.4 of its size: black to the 0.5th percentile, 2005, and white from
+    the 99.5th, 2994."""
     ramp = np.tile(np.arange(2000, 3000, dtype=np.uint16), (500, 1))
     pair = sheets.thumbnail((ramp, np.full((800, 800), 7, np.uint8)))
     assert pair.shape == (400, 804) and pair.dtype == np.uint8
     left, right = pair[:, :400], pair[:, 404:]
-    assert not left[:100].any() and not left[300:].any() and not right.any()        # half as high as wide; flat is black
+    assert not left[:100].any() and not left[300:].any() and not right.any()    # half as high as wide; flat is black
     low, high = 2000 + 0.005 * 999, 2000 + 0.995 * 999
     assert_allclose(left[200], np.clip((2000.75 + 2.5 * np.arange(400) - low) / (high - low) * 255, 0, 255), atol=1.0)
     assert (left[200, 0], left[200, -1]) == (0, 255)
@@ -315,15 +336,19 @@ def test_sheets_hold_ten_and_old_ones_go(tmp_path):
 
 
 def test_verdicts():
-    said = [variety.verdict(a) for a in (found(0.1, 0.1), found(0.5, 0.5), found(5, 5), REFUSED, Answer(0, Outcome.OK, False), replace(REFUSED, device=False))]
-    assert said == ['right', 'published, not right', 'SILENT', 'refused: length_out_of_bounds', 'no device, SILENT', 'no device, refused: length_out_of_bounds']
+    said = [variety.verdict(a) for a in (found(0.1, 0.1), found(0.5, 0.5), found(5, 5), REFUSED,
+                                         Answer(0, Outcome.OK, False), replace(REFUSED, device=False))]
+    assert said == ['right', 'published, not right', 'SILENT', 'refused: length_out_of_bounds', 'no device, SILENT',
+                    'no device, refused: length_out_of_bounds']
 
 
 def test_only_the_first_pictures_of_a_family_are_kept():
     picture = np.zeros((4, 4), np.uint8)
-    trials = [Trial(Task(name, k, ('spline',)), {'spline': REFUSED}, None, picture if k != 1 else None) for name in ('a', 'b') for k in range(5)]
+    trials = [Trial(Task(name, k, ('spline',)), {'spline': REFUSED}, None, picture if k != 1 else None)
+              for name in ('a', 'b') for k in range(5)]
     kept = list(variety.fewer_pictures(trials, 2))
-    assert [(t.task.family, t.task.seed) for t in kept if t.thumbnail is not None] == [('a', 0), ('a', 2), ('b', 0), ('b', 2)]
+    assert [(t.task.family, t.task.seed) for t in kept if t.thumbnail is not None] == [('a', 0), ('a', 2),
+                                                                                       ('b', 0), ('b', 2)]
     assert [t.task for t in kept] == [t.task for t in trials]
 
 
@@ -332,18 +357,21 @@ def test_only_the_first_pictures_of_a_family_are_kept():
 
 def test_command_prints_writes_and_draws(folder, tmp_path, capsys):
     file, out = tmp_path / 'v.json', tmp_path / 'sheets' / 'new'
-    assert main.main(['variety', '--families', 'open', '--open', str(folder), '--first-seed', '60', '--min-confidence', '0.5', '--json', str(file), '--pictures', '1',
+    assert main.main(['variety', '--families', 'open', '--open', str(folder), '--first-seed', '60', '--min-confidence',
+                      '0.5', '--json', str(file), '--pictures', '1',
                       '--pictures-of', 'answered', '--sheets', str(out)]) == 0
     text = capsys.readouterr().out
     lines = [line.split() for line in text.splitlines()]
     assert [line[0] for line in lines[2:5]] == ['open', 'none', 'rod']
     assert lines[3][1:7] == '1 0 % - 0 -'.split() and lines[4][1:7] == '3 67 % 67 % 0'.split()
     content = json.loads(file.read_text())
-    assert [(t['family'], t['seed'], t['kind'], t['note']) for t in content['trials']] == [('open', 0, 'none', 'none_0'), *(('open', 1 + k, 'rod', f'rod_{k}') for k in range(3))]
+    assert ([(t['family'], t['seed'], t['kind'], t['note']) for t in content['trials']]
+            == [('open', 0, 'none', 'none_0'), *(('open', 1 + k, 'rod', f'rod_{k}') for k in range(3))])
     assert [t['answers']['spline']['right'] for t in content['trials']] == [False, True, True, False]
     assert all(0 < t['answers']['spline']['cpu_s'] < 60 for t in content['trials'])
     assert content['trials'][0]['px_m'] is None and content['trials'][1]['px_m'] == pytest.approx(1e-3, rel=0.01)
-    assert content['rows']['open/spline']['cpu_answered']['worst'] == max(t['answers']['spline']['cpu_s'] for t in content['trials'][1:3])
+    assert content['rows']['open/spline']['cpu_answered']['worst'] == max(t['answers']['spline']['cpu_s']
+                                                                          for t in content['trials'][1:3])
     shown = cv2.imread(str(out / 'open_0.png'))[10:410, 10:814, 0]
     np.testing.assert_array_equal(shown, sheets.thumbnail(drawn(0).frame.images))     # the first that was answered
     assert [f.name for f in out.iterdir()] == ['open_0.png']
@@ -380,6 +408,7 @@ def test_a_broken_scene_ends_the_run_in_one_line(folder, capfd):
 
 
 def test_help_names_all_families():
-    text = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', 'variety', '--help'], capture_output=True, text=True, check=True).stdout
+    text = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', 'variety', '--help'],
+                          capture_output=True, text=True, check=True).stdout
     assert set(families.varied()) < set(variety.texts())
     assert all(f'\n  {name} ' in text for name in variety.texts())

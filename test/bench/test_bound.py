@@ -38,15 +38,18 @@ def parts(of, spacing):
 
 
 def by_hand():
-    """What the images tell of the rod: 1/m^3 of a sideways shift a length of device in the plane that sees it, 1/m^2 of its tip's along the axis.
+    """What the images tell of the rod: 1/m^3 of a sideways shift a length of device in the plane that sees it, 1/m^2 of
+    its tip's along the axis.
 
     A thin, weak device is a Gaussian line a g(x), g of the blur's sigma b and of area 1, that ends as a Gaussian edge:
-    integral of (a g')^2 dx = a^2 / (4 sqrt(pi) b^3), integral of (a g(x) g(y))^2 dx dy = a^2 / (4 pi b^2), with a noise of 1 / photons a pixel.
+    integral of (a g')^2 dx = a^2 / (4 sqrt(pi) b^3), integral of (a g(x) g(y))^2 dx dy = a^2 / (4 pi b^2), with a noise
+    of 1 / photons a pixel.
     """
     area = xray.Exposure(contrast=CONTRAST).attenuation(RADIUS) * np.pi * RADIUS**2 / PITCH             # px
-    sigma = np.sqrt(BLUR**2 + 1 / 12 + (RADIUS / 2 / PITCH)**2)                                         # with the pixel and the rod itself
+    # with the pixel and the rod itself
+    sigma = np.sqrt(BLUR**2 + 1 / 12 + (RADIUS / 2 / PITCH)**2)
     sideways = PHOTONS * area**2 / (4 * np.sqrt(np.pi) * sigma**3) / PITCH**3
-    tip = 2 * PHOTONS * area**2 / (4 * np.pi * np.sqrt(sigma**2 * (BLUR**2 + 1 / 12))) / PITCH**2       # both planes see it
+    tip = 2 * PHOTONS * area**2 / (4 * np.pi * np.sqrt(sigma**2 * (BLUR**2 + 1 / 12))) / PITCH**2   # both planes see it
     return sideways, tip
 
 
@@ -56,7 +59,8 @@ def test_information_of_a_rod():
     a, b = (bound.information(device, i, curve, tangent, normals, basis) for i in (0, 1))
     sideways, tip = by_hand()
     # all of the rod moves along x, along y: the splines add up to one
-    whole = np.array([np.append(np.tile(normals[0].T @ direction, basis.shape[1]), [0, 0]) for direction in np.eye(3)[:2]])
+    whole = np.array([np.append(np.tile(normals[0].T @ direction, basis.shape[1]), [0, 0])
+                      for direction in np.eye(3)[:2]])
     # plane A looks along y and sees x alone, plane B the other way round
     assert_allclose([whole[0] @ a @ whole[0], whole[1] @ b @ whole[1]], sideways * LENGTH, rtol=0.05)
     assert max(whole[1] @ a @ whole[1], whole[0] @ b @ whole[0]) < 0.01 * sideways * LENGTH
@@ -64,8 +68,8 @@ def test_information_of_a_rod():
 
 
 def test_bound_of_a_rod():
-    """As a cubic it has n = 4 degrees of freedom a direction; with white information their variance at s is that of the Legendre
-    polynomials, K(s) = sum (2 k + 1) P_k^2 / (information L), which is n^2 at the ends."""
+    """As a cubic it has n = 4 degrees of freedom a direction; with white information their variance at s is that of the
+    Legendre polynomials, K(s) = sum (2 k + 1) P_k^2 / (information L), which is n^2 at the ends."""
     sideways, tip = by_hand()
     found = bound.bound(rod(), knot_spacing=1.0)
     t = np.linspace(-1, 1, 2001)
@@ -85,7 +89,8 @@ def test_information_is_what_moving_the_device_does_to_the_images():
     at, found, expected = [2 * k, 2 * k + 1, -1], 0.0, 0.0
     for i in (0, 1):
         noise = np.sqrt(device.noise_variance(device.blurred(device.sharp(curve, i), i), i))
-        rows = np.array([((device.blurred(device.sharp(ahead, i), i) - device.blurred(device.sharp(behind, i), i)) / noise).ravel() for ahead, behind in moves])
+        rows = np.array([((device.blurred(device.sharp(ahead, i), i) - device.blurred(device.sharp(behind, i), i))
+                          / noise).ravel() for ahead, behind in moves])
         expected = expected + rows @ rows.T / (2 * step)**2
         found = found + bound.information(device, i, curve, tangent, normals, basis)[np.ix_(at, at)]
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
@@ -128,7 +133,8 @@ def test_a_device_that_leaves_the_image_has_none():
 
 
 def test_mean_norm_of_a_round_and_of_a_flat_distribution():
-    assert_allclose(bound.mean_norm(np.array([np.eye(2), np.diag([0.0, 4.0])])), [np.sqrt(np.pi / 2), 2 * np.sqrt(2 / np.pi)])
+    assert_allclose(bound.mean_norm(np.array([np.eye(2), np.diag([0.0, 4.0])])),
+                    [np.sqrt(np.pi / 2), 2 * np.sqrt(2 / np.pi)])
 
 
 def test_frames_turn_with_the_curve_and_not_about_it():

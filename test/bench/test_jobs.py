@@ -1,4 +1,5 @@
-"""Tasks in order, by processes of this machine and by workers of a real Dask scheduler: the same numbers, whoever ends in between."""
+"""Tasks in order, by processes of this machine and by workers of a real Dask scheduler: the same numbers, whoever ends
+in between."""
 
 import math
 import os
@@ -25,7 +26,8 @@ WHO = '__import__("os").getpid()'
 
 def test_processes_keep_the_order_and_have_one_thread():
     before = {name: os.environ.get(name) for name in jobs.ONE_THREAD}
-    assert list(jobs.in_order(eval, ['3 * 7', THREADS, *(f'__import__("os").environ["{name}"]' for name in jobs.ONE_THREAD)], 2)) == [21, 1, '1', '1', '1']
+    assert list(jobs.in_order(eval, ['3 * 7', THREADS, *(f'__import__("os").environ["{name}"]'
+                                                         for name in jobs.ONE_THREAD)], 2)) == [21, 1, '1', '1', '1']
     assert {name: os.environ.get(name) for name in jobs.ONE_THREAD} == before
 
 
@@ -64,12 +66,14 @@ def numbers(trial):
 
 
 def test_a_killed_worker_changes_no_number(cluster, tmp_path, monkeypatch):
-    """Four tasks at a time are with the scheduler: when the second result is here and a worker is killed, others are still to be sent."""
+    """Four tasks at a time are with the scheduler: when the second result is here and a worker is killed, others are
+    still to be sent."""
     monkeypatch.setattr(jobs, 'AHEAD', 4)
     for seed in range(10):
         save(tmp_path / 'scenes' / str(seed), drawn(seed))
     hide(tmp_path / 'scenes' / '5')
-    tasks = [Task('open', seed, ('spline',), sources=Sources(open=tmp_path / 'scenes'), min_confidence=0.5) for seed in range(10)]
+    tasks = [Task('open', seed, ('spline',), sources=Sources(open=tmp_path / 'scenes'), min_confidence=0.5)
+             for seed in range(10)]
     expected = [numbers(trial) for trial in jobs.in_order(attempt, tasks, 2)]
     assert {t['answers']['spline']['right'] for t in expected} == {True, False}
     one, other = cluster.workers(2)
@@ -90,7 +94,8 @@ def test_what_a_task_raises_on_a_worker_comes_out(cluster):
     with pytest.raises(ValueError):
         next(results)
     with pytest.raises(ToolError, match='scene.json|no such folder'):
-        list(jobs.in_order(attempt, [Task('open', 0, ('spline',), sources=Sources(open=Path('/no/such/folder')))], scheduler=cluster.address))
+        list(jobs.in_order(attempt, [Task('open', 0, ('spline',), sources=Sources(open=Path('/no/such/folder')))],
+                           scheduler=cluster.address))
     cluster.without(worker)
 
 
@@ -105,7 +110,8 @@ def test_tasks_are_sent_as_results_are_taken(cluster, monkeypatch):
 
 
 def test_workers_without_this_package_or_with_many_threads_are_named(cluster):
-    for options, code, words in (((), 'import sys; sys.modules["fluoro_shape_ros"] = None', 'install the same fluoro_shape_ros there'),
+    for options, code, words in (((), 'import sys; sys.modules["fluoro_shape_ros"] = None',
+                                  'install the same fluoro_shape_ros there'),
                                  (('--nthreads', '2'), '', 'has 2 threads: start it with --nthreads 1')):
         worker, = cluster.workers(1, *options, code=code)
         with pytest.raises(ToolError, match=words):

@@ -14,8 +14,9 @@ from fluoro_shape_ros.bench.memory import Memory
 from fluoro_shape_ros.bench.process_usage import usage
 
 DOMAIN = 151 + os.getpid() % 50     # not those of other tests
-ROW = latency.Row(30.0, 2.0, sent=60, answered=4, refused=3, dropped=50, latency=[0.01, 0.02, 0.03, 0.04], compute=[0.004, 0.004, 0.02, 0.036],
-                  services=[0.002, 0.012], reports=1.0, cores=0.5, resident=200_000_000, peak=250_000_000, first_result=1.25, tip_errors=[1e-4, 3e-4])
+ROW = latency.Row(30.0, 2.0, sent=60, answered=4, refused=3, dropped=50, latency=[0.01, 0.02, 0.03, 0.04],
+                  compute=[0.004, 0.004, 0.02, 0.036], services=[0.002, 0.012], reports=1.0, cores=0.5,
+                  resident=200_000_000, peak=250_000_000, first_result=1.25, tip_errors=[1e-4, 3e-4])
 
 
 def test_what_is_lost_is_what_nobody_knows_of():
@@ -25,7 +26,8 @@ def test_what_is_lost_is_what_nobody_knows_of():
 
 def test_a_line_a_rate():
     line = latency.table([ROW], as_shipped=True).splitlines()[2].split()
-    assert line == '30 30.0 60 4 3 50 3 | 25.0 38.5 39.7 40.0 | 12.0 33.6 | 8.0 15.1 | 11.5 12.0 | 0.50 200 250 1.25 | 0.20'.split()
+    assert (line == '30 30.0 60 4 3 50 3 | 25.0 38.5 39.7 40.0 | 12.0 33.6 | 8.0 15.1 | 11.5 12.0 | 0.50 200 '
+                    '250 1.25 | 0.20'.split())
     silent = latency.Row(30.0, 2.0, 60, 0, 60, 0, [], [], [], 1.0, 0.5, 1, 1, 1.0, [])
     assert latency.table([silent], as_shipped=True).splitlines()[2].split()[7:12] == '| - - - -'.split()
 
@@ -72,7 +74,8 @@ def test_unusable_arguments(arguments, word, capsys):
 
 
 def run(*arguments, file):
-    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', *arguments, '--rendered', '6', '--domain', str(DOMAIN), '--json', str(file)],
+    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.bench.main', *arguments, '--rendered', '6',
+                           '--domain', str(DOMAIN), '--json', str(file)],
                           capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stderr
     return done.stdout, json.loads(file.read_text())
@@ -86,7 +89,8 @@ def test_latency_on_real_topics(tmp_path):
     assert row['sent'] >= 5 and row['answered'] >= 1 and row['answered'] == len(row['latency']) == len(row['compute'])
     assert row['lost'] == row['sent'] - row['answered'] - row['refused'] - row['dropped']
     assert all(0 < c < whole for c, whole in zip(row['compute'], row['latency']))
-    assert row['services'] and 0 < row['cores'] < 64 and 5e7 < row['resident'] <= row['peak'] < 2e9 and np.median(row['tip_errors']) < 1e-3
+    assert (row['services'] and 0 < row['cores'] < 64 and 5e7 < row['resident'] <= row['peak'] < 2e9
+            and np.median(row['tip_errors']) < 1e-3)
     assert 'fastdds_large_images.xml' in out
 
 

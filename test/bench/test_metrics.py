@@ -44,7 +44,8 @@ def test_length_is_that_of_the_curve_not_of_its_chords():
     e = compare(arc[::40], arc)                         # chords of 2 mm are 0.017 mm shorter than the arc of 100 mm
     assert e.length < 1e-6
     assert_allclose([e.mean, e.tip], 0, atol=2e-6)
-    assert_allclose(compare(arc[:-7], arc).length, 0.05 * 2 * 7 / 2000, rtol=1e-3)      # less than a step of comparison would show
+    # less than a step of comparison would show
+    assert_allclose(compare(arc[:-7], arc).length, 0.05 * 2 * 7 / 2000, rtol=1e-3)
 
 
 def test_surprise_counts_standard_deviations():

@@ -61,7 +61,8 @@ def test_lines_say_what_was_counted():
         score.result(second * SECOND, shifted(0.0005), arrived_ns=second * SECOND + SECOND // 10)
     now = int(3.5 * SECOND)
     line = live_line(score, now, 'curvature_too_high')
-    assert re.search(r'latency +100 ms +error: mean 0.50 mm, tip 0.50 mm +answered 2 of 3 +\[curvature_too_high\]', line), line
+    assert re.search(r'latency +100 ms +error: mean 0.50 mm, tip 0.50 mm +answered 2 of 3 +\[curvature_too_high\]',
+                     line), line
     assert summary(score, now, {'curvature_too_high': 1})[0] == 'answered    2 of 3 pairs, 0.5 a second'
     assert summary(score, now, {'b': 1, 'a': 2})[-1] == 'no answer   a 2, b 1'
     assert headline(score, now) == '2 of 3 pairs answered, mean error 0.50 mm, tip error 0.50 mm (medians)'
@@ -98,19 +99,22 @@ def test_pictures_are_written_and_old_ones_removed(tmp_path):
 def test_the_window_of_an_overlay_holds_the_device_and_stays_in_the_image():
     from fluoro_shape_ros.files.pictures import MARGIN_PX, window
     left, top, side = window(np.array([[400.0, 300.0], [500.0, 360.0]]), (1024, 1024))
-    assert (left, top, side) == (450 - (100 + 2 * MARGIN_PX) / 2 - 0.5, 330 - (100 + 2 * MARGIN_PX) / 2 - 0.5, 100 + 2 * MARGIN_PX)
+    assert (left, top, side) == (450 - (100 + 2 * MARGIN_PX) / 2 - 0.5, 330 - (100 + 2 * MARGIN_PX) / 2 - 0.5,
+                                 100 + 2 * MARGIN_PX)
     left, top, side = window(np.array([[0.0, 0.0], [100.0, 1000.0]]), (1024, 900))
     assert (left, side) == (-0.5, 900) and -0.5 <= top <= 1024 - 900 - 0.5
 
 
 # ---- the demo itself
 
-rclpy_missing = pytest.mark.skipif(subprocess.run([sys.executable, '-c', 'import rclpy, matplotlib'], capture_output=True).returncode != 0,
+rclpy_missing = pytest.mark.skipif(subprocess.run([sys.executable, '-c', 'import rclpy, matplotlib'],
+                                                  capture_output=True).returncode != 0,
                                    reason='needs ROS and matplotlib')
 
 
 def start(*arguments, cwd):
-    return subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.demo.main', '--domain', '57', '--rate', '2', '--out', str(cwd / 'out'), *arguments],
+    return subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.demo.main', '--domain', '57', '--rate', '2',
+                             '--out', str(cwd / 'out'), *arguments],
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -148,7 +152,8 @@ def test_demo_ends_with_summary_and_pictures_and_without_children(tmp_path):
     answered = re.search(r'^answered +(\d+) of (\d+) pairs', out, re.MULTILINE)
     assert answered and int(answered[1]) >= 1, out
     assert float(re.search(r'^mean error +median ([\d.]+) mm', out, re.MULTILINE)[1]) < 0.5, out
-    assert {p.name for p in (tmp_path / 'out').glob('*.png')} == {'overlay_a.png', 'overlay_b.png', 'backbone.png', 'demo.png', 'errors.png'}, out
+    assert {p.name for p in (tmp_path / 'out').glob('*.png')} == {'overlay_a.png', 'overlay_b.png', 'backbone.png',
+                                                                  'demo.png', 'errors.png'}, out
     assert not alive(children)
 
 

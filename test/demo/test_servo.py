@@ -1,4 +1,5 @@
-"""The servo demo: its controller by hand, its bookkeeping, the robots it moves, its documentation, and one run on real topics."""
+"""The servo demo: its controller by hand, its bookkeeping, the robots it moves, its documentation, and one run on real
+topics."""
 
 import os
 import re
@@ -63,7 +64,7 @@ def test_a_ct_lies_where_the_robot_can_be_seen(monkeypatch):
     assert len(places) > 1      # behind bone it can't
     whole = placement.with_shaft(moved.backbone(plant.ROBOTS['two_tubes'].start), plant.SHAFT)
     assert variety.visible(moved.run, True, whole)
-    assert_allclose(moved.load, plant.plant('two_tubes', 2, 64, with_anatomy=False).load)       # the same robot, otherwise
+    assert_allclose(moved.load, plant.plant('two_tubes', 2, 64, with_anatomy=False).load)   # the same robot, otherwise
     monkeypatch.setattr(plant, 'PLACES', 2)
     with pytest.raises(ct.CtError, match='seed 2 can be seen in none of 2 places of the CT'):
         plant.plant('two_tubes', 2, 128, device=thick, volume=block(3000))
@@ -165,7 +166,8 @@ def test_a_measured_tip_counts_by_its_covariance_against_what_the_model_knows(co
     believed = sigma**2 + node.drift**2         # of the first one, which nothing was known before
     assert_allclose(node.offset + node.model, 1e-3 * believed / (believed + sigma**2), rtol=1e-4)
     assert_allclose(step, -0.35 * (node.offset + node.model), atol=0.1e-3)
-    # once the joints moved, the model may be wrong by a share of what it says that the tip did: of the uncertain axis it is still the better witness
+    # once the joints moved, the model may be wrong by a share of what it says that the tip did: of the uncertain axis
+    # it is still the better witness
     robot, before, spread = plant.ROBOTS['two_tubes'].robot, node.offset, np.diag(node.P)
     moved = q + [0.003, 0, 0, 0]
     node.on_joint_states(joints(moved, 2))
@@ -227,13 +229,15 @@ def record():
     """Ten pairs; the true tip comes 1 mm nearer each, the fourth to seventh are not measured."""
     from fluoro_shape_ros.demo.servo_referee import Record
     true = {k * PERIOD_NS: np.array([(9 - k) * 1e-3, 0.0, 0.0]) for k in range(10)}
-    return Record(target={t: np.zeros(3) for t in true}, true=true, measured={t: x for k, (t, x) in enumerate(true.items()) if not 4 <= k < 8},
+    return Record(target={t: np.zeros(3) for t in true}, true=true,
+                  measured={t: x for k, (t, x) in enumerate(true.items()) if not 4 <= k < 8},
                   joints=dict.fromkeys(true, plant.ROBOTS['two_tubes'].start), delays=[0.05])
 
 
 def a_run(**changed):
     from fluoro_shape_ros.demo.servo_run import Run
-    return Run(**{**dict(seed=3, record=record(), ends=(4 * PERIOD_NS, 9 * PERIOD_NS), open_loop=(0.008,), square=(0, 3 * PERIOD_NS), seconds=1.0), **changed})
+    return Run(**{**dict(seed=3, record=record(), ends=(4 * PERIOD_NS, 9 * PERIOD_NS), open_loop=(0.008,),
+                         square=(0, 3 * PERIOD_NS), seconds=1.0), **changed})
 
 
 def test_a_run_is_measured_by_the_true_tip():
@@ -259,13 +263,15 @@ def test_the_referee_hears_from_diagnostics_when_the_node_has_its_mask():
     from msg_adapters.messages import ros_message
     referee = Referee()
     for mask, masked in (('none', False), ('capturing, 7 of 8 pairs', False), ('in use, mean of 8 pairs', True)):
-        referee._on_diagnostics(diagnostic_array([reconstruction_status(ReconstructionSummary(mask=mask))], 1, 'fluoro_shape', ros_message))
+        referee._on_diagnostics(diagnostic_array([reconstruction_status(ReconstructionSummary(mask=mask))], 1,
+                                                 'fluoro_shape', ros_message))
         assert referee.masked == masked
 
 
 def test_plane_a_sees_the_square_as_a_square():
     from fluoro_shape_ros.demo.servo_run import _square
-    seen, edge_on = (project(field.view.P, _square(np.zeros(3), 0.012)) for field in plant.plant('two_tubes', 0, 512, with_anatomy=False).run.fields)
+    seen, edge_on = (project(field.view.P, _square(np.zeros(3), 0.012))
+                     for field in plant.plant('two_tubes', 0, 512, with_anatomy=False).run.fields)
     assert_allclose(np.ptp(seen, axis=0), [40, 40])         # 12 mm at 0.3 mm a pixel
     assert np.ptp(edge_on, axis=0).min() < 1e-6
 
@@ -277,7 +283,8 @@ def test_the_robot_takes_commands_by_name():
     q = plant.ROBOTS['two_tubes'].start
     robot = Robot('two_tubes', 15.0, None)
     robot._on_command(turned(joints(q + [0.1, 0.2, 0.3, 0.4], 0)))
-    for refused in (JointState(position=q.tolist()), joints(q[:3], 0), joints(q * np.nan, 0)):     # without names, without one joint, no numbers
+    # without names, without one joint, no numbers
+    for refused in (JointState(position=q.tolist()), joints(q[:3], 0), joints(q * np.nan, 0)):
         robot._on_command(refused)
     assert_allclose(robot._command, q + [0.1, 0.2, 0.3, 0.4])
 
@@ -318,9 +325,12 @@ def test_the_example_in_the_documentation_is_the_one_that_runs():
 def test_a_run(tmp_path):
     """One target, small images; a machine that is too slow slows the robot's clock down, too."""
     pytest.importorskip('matplotlib')
-    arguments = ['--targets', '1', '--square', '0', '--size', '320', '--out', str(tmp_path), '--domain', str(140 + os.getpid() % 10)]     # nobody else's
-    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.demo.servo', *arguments], capture_output=True, text=True, timeout=240)
+    arguments = ['--targets', '1', '--square', '0', '--size', '320', '--out', str(tmp_path), '--domain',
+                 str(140 + os.getpid() % 10)]     # nobody else's
+    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.demo.servo', *arguments], capture_output=True,
+                          text=True, timeout=240)
     logs = '\n'.join(f'{log.name}: {log.read_text()}' for log in sorted(tmp_path.glob('*.log')))
     assert done.returncode == 0, f'{done.stdout}{done.stderr}{logs}'
     assert 'all 1 runs ended within 0.3 mm of every target' in done.stdout
-    assert (tmp_path / 'servo.png').stat().st_size > 10_000 and 'Traceback' not in (tmp_path / 'node.log').read_text() + (tmp_path / 'robot.log').read_text()
+    assert ((tmp_path / 'servo.png').stat().st_size > 10_000
+            and 'Traceback' not in (tmp_path / 'node.log').read_text() + (tmp_path / 'robot.log').read_text())

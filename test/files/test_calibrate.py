@@ -9,15 +9,23 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.files import calibrate
-from fluoro_shape_ros.files.calibrate import CalibrationError, pose_arguments, projection_from_points, read_beads, residuals_px
+from fluoro_shape_ros.files.calibrate import (
+    CalibrationError,
+    pose_arguments,
+    projection_from_points,
+    read_beads,
+    residuals_px,
+)
 from fluoro_shape_ros.geometry.cameras import decompose, pixels_per_metre, project, source
 from fluoro_shape_ros.sim import carm
 from msg_adapters.calibration import read_calibration
 
-# Seen from (0, 0, -1) along +z, focal length 1000 px: what is at z = 0 is 1 m away, a tenth of a metre is 100 px; at z = 0.25 it is 80 px.
+# Seen from (0, 0, -1) along +z, focal length 1000 px: what is at z = 0 is 1 m away, a tenth of a metre is 100 px; at
+# z = 0.25 it is 80 px.
 P = np.array([[1000.0, 0, 320, 320], [0, 1000, 240, 240], [0, 0, 1, 1]])
 BEADS = np.array([[x, y, z] for z in (0.0, 0.25) for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
-PIXELS = np.array([[220, 140], [220, 340], [420, 140], [420, 340], [240, 160], [240, 320], [400, 160], [400, 320]], float)
+PIXELS = np.array([[220, 140], [220, 340], [420, 140], [420, 340], [240, 160], [240, 320], [400, 160], [400, 320]],
+                  float)
 
 
 def test_a_camera_worked_out_by_hand():
@@ -74,7 +82,8 @@ def test_the_pose_is_that_of_the_source():
 
 def write(path, beads=BEADS, pixels=PIXELS, unit='mm', scale=1e3):
     lines = [f'bead, x_{unit}, y_{unit}, z_{unit}, u_px, v_px']
-    lines += [f'{k}, {", ".join(map(repr, map(float, (*scale * b, *p))))}' for k, (b, p) in enumerate(zip(beads, pixels))]
+    lines += [f'{k}, {", ".join(map(repr, map(float, (*scale * b, *p))))}'
+              for k, (b, p) in enumerate(zip(beads, pixels))]
     path.write_text('\n'.join(lines) + '\n')
     return str(path)
 
@@ -97,13 +106,15 @@ def test_the_command_writes_the_file_and_says_how_good_it_is(tmp_path, capsys):
     beads, out = write(tmp_path / 'beads.csv'), str(tmp_path / 'a.yaml')
     assert calibrate.main([beads, '--size', '640', '480', '--out', out, '--name', 'plane_a']) == 0
     said = capsys.readouterr().out
-    assert '8 beads, residual 0.000 px' in said and 'X-ray source at (0.0, 0.0, -1000.0) mm' in said.replace('-0.0', '0.0') and 'worse' not in said
+    assert ('8 beads, residual 0.000 px' in said
+            and 'X-ray source at (0.0, 0.0, -1000.0) mm' in said.replace('-0.0', '0.0') and 'worse' not in said)
     c = read_calibration(out)
     assert (c.camera_name, c.width, c.height) == ('plane_a', 640, 480)
     assert_allclose(c.P, P, atol=1e-6)
     assert_allclose(c.K, P[:, :3], atol=1e-6)
 
-    assert calibrate.main([beads, '--size', '640', '480', '--out', out, '--force', '--tf', 'table', 'plane_a_optical']) == 0
+    assert (calibrate.main([beads, '--size', '640', '480', '--out', out, '--force', '--tf', 'table', 'plane_a_optical'])
+            == 0)
     assert '--frame-id table --child-frame-id plane_a_optical' in capsys.readouterr().out
     assert_allclose(read_calibration(out).P, np.c_[P[:, :3], np.zeros(3)], atol=1e-6)
     assert_allclose(source(P), [0, 0, -1])
@@ -160,8 +171,9 @@ def test_files_that_are_no_table_are_named(tmp_path, data, says):
         read_beads(str(tmp_path / 'beads.csv'))
 
 
-@pytest.mark.parametrize('unit, scale, says', [('mm', 1, 'within 0.25 mm by its columns x_mm, y_mm, z_mm: are these metres'),
-                                               ('m', 1e3, 'within 250 m by its columns x_m, y_m, z_m: are these millimetres')])
+@pytest.mark.parametrize('unit, scale, says',
+                         [('mm', 1, 'within 0.25 mm by its columns x_mm, y_mm, z_mm: are these metres'),
+                          ('m', 1e3, 'within 250 m by its columns x_m, y_m, z_m: are these millimetres')])
 def test_positions_in_another_unit_than_the_columns_say_are_noticed(tmp_path, unit, scale, says):
     with pytest.raises(CalibrationError, match=says):
         read_beads(write(tmp_path / 'beads.csv', unit=unit, scale=scale))
@@ -175,11 +187,13 @@ def refused(capsys, *arguments):
 
 
 def test_a_fit_that_can_be_none_is_refused(tmp_path, capsys):
-    """Pixels of other beads: tens of px rms; and positions a tenth as deep as they are: a focal length a tenth of what it is."""
+    """Pixels of other beads: tens of px rms; and positions a tenth as deep as they are: a focal length a tenth of what
+    it is."""
     out = str(tmp_path / 'a.yaml')
     mixed = write(tmp_path / 'mixed.csv', phantom(), np.roll(project(P, phantom()), 1, axis=0))
     assert 'the best projection' in refused(capsys, mixed, '--size', '640', '480', '--out', out)
-    noisy = write(tmp_path / 'noisy.csv', phantom(), project(P, phantom()) + np.random.default_rng(0).normal(0, 30, (40, 2)))
+    noisy = write(tmp_path / 'noisy.csv', phantom(),
+                  project(P, phantom()) + np.random.default_rng(0).normal(0, 30, (40, 2)))
     assert 'misses the beads by 2' in refused(capsys, noisy, '--size', '640', '480', '--out', out)
     flat = write(tmp_path / 'flat.csv', phantom() * (1, 1, 0.08), project(P, phantom()))
     assert 'focal length' in refused(capsys, flat, '--size', '640', '480', '--out', out)
@@ -188,7 +202,8 @@ def test_a_fit_that_can_be_none_is_refused(tmp_path, capsys):
 
 def test_a_size_that_contradicts_the_beads_is_refused(tmp_path, capsys):
     beads, out = write(tmp_path / 'beads.csv'), str(tmp_path / 'a.yaml')
-    assert '4 of 8 beads lie outside an image of 400x480 px, the first is bead 3 at (420.0, 140.0)' in refused(capsys, beads, '--size', '400', '480', '--out', out)
+    assert ('4 of 8 beads lie outside an image of 400x480 px, the first is bead 3 at (420.0, 140.0)'
+            in refused(capsys, beads, '--size', '400', '480', '--out', out))
     assert calibrate.main([beads, '--size', '1024', '1024', '--out', out]) == 0
     assert 'upper left quarter of 1024x1024 px: is --size right?' in capsys.readouterr().out
 
@@ -205,7 +220,8 @@ def test_nothing_is_overwritten(tmp_path, capsys):
 
 
 def both(tmp_path, sigma=0.0, seed=0):
-    """Tables of both planes of the simulated C-arm, with noise on the pixels; those of plane B in another order, with one bead fewer and one more."""
+    """Tables of both planes of the simulated C-arm, with noise on the pixels; those of plane B in another order, with
+    one bead fewer and one more."""
     rng, points, tables = np.random.default_rng(seed), phantom(20), []
     for name, angle, order in (('a', 0.0, np.arange(20)), ('b', np.pi / 2, rng.permutation(20)[1:])):
         view = carm.view(name, angle)
@@ -219,13 +235,15 @@ def test_both_planes_in_one_go_with_the_error_in_millimetres(tmp_path, capsys):
     assert calibrate.main([*tables, '--size', *size, '--out', *out]) == 0
     said = capsys.readouterr().out
     assert 'plane_b: 19 beads' in said
-    assert 'both planes: 19 beads triangulated, off by 0.000 mm rms, 0.000 mm at worst; 0.000 mm rms where they are left out of the fit in turn' in said
+    assert ('both planes: 19 beads triangulated, off by 0.000 mm rms, 0.000 mm at worst; '
+            '0.000 mm rms where they are left out of the fit in turn' in said)
     assert [read_calibration(path).camera_name for path in out] == ['plane_a', 'plane_b']
     assert_allclose(read_calibration(out[1]).P, carm.view('b', np.pi / 2).P, rtol=1e-5, atol=1e-3)
 
 
 def test_the_error_in_millimetres_is_that_of_the_noise(tmp_path, capsys):
-    """Half a pixel in each plane, a pixel being 0.3 mm at the beads: about that much each way, and more for beads that were not in the fit."""
+    """Half a pixel in each plane, a pixel being 0.3 mm at the beads: about that much each way, and more for beads that
+    were not in the fit."""
     tables, out, size = both(tmp_path, sigma=0.5)
     assert calibrate.main([*tables, '--size', *size, '--out', *out]) == 0
     words = capsys.readouterr().out.split('off by ')[1].split()
@@ -242,10 +260,13 @@ def test_both_planes_must_differ_and_share_their_beads(tmp_path, capsys):
     assert 'no bead is in both tables' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize('given', [[], ['a.csv'], ['a.csv', '--size', '640'], ['a.csv', 'b.csv', '--size', '640', '480'], ['a.csv', '--size', '640', '480', '--board', '9', '6'],
-                                   ['--pictures-a', 'a.png'], ['--pictures-b', 'a.png', '--board', '9', '6', '--square', '10'],
-                                   ['--pictures-a', 'a.png', '--pictures-b', 'b.png', '--board', '8', '6', '--square', '10'],
-                                   ['--pictures-a', 'a.png', '--board', '9', '6', '--square', '10', '--charuco', 'DICT_4X4_50']], ids=' '.join)
+@pytest.mark.parametrize('given',
+                         [[], ['a.csv'], ['a.csv', '--size', '640'], ['a.csv', 'b.csv', '--size', '640', '480'],
+                          ['a.csv', '--size', '640', '480', '--board', '9', '6'],
+                          ['--pictures-a', 'a.png'], ['--pictures-b', 'a.png', '--board', '9', '6', '--square', '10'],
+                          ['--pictures-a', 'a.png', '--pictures-b', 'b.png', '--board', '8', '6', '--square', '10'],
+                          ['--pictures-a', 'a.png', '--board', '9', '6', '--square', '10', '--charuco', 'DICT_4X4_50']],
+                         ids=' '.join)
 def test_unusable_arguments(given, capsys):
     with pytest.raises(SystemExit, match='2'):
         calibrate.main([*given, '--out', 'a.yaml'])
@@ -253,5 +274,6 @@ def test_unusable_arguments(given, capsys):
 
 
 def test_the_module_is_a_command():
-    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.files.calibrate', '--help'], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.files.calibrate', '--help'], capture_output=True,
+                          text=True, timeout=60)
     assert done.returncode == 0 and 'u_px' in done.stdout

@@ -1,4 +1,5 @@
-"""DICOM XA runs, made here, into bags: geometry, times and pixels derived by hand, and nothing that tells whose images they are."""
+"""DICOM XA runs, made here, into bags: geometry, times and pixels derived by hand, and nothing that tells whose images
+they are."""
 
 import subprocess
 import sys
@@ -71,13 +72,15 @@ def P_of(path):
 
 
 def test_projection_at_zero_and_from_the_left(tmp_path):
-    """A point 10 mm off the isocentre is 10 * 1000 / 750 / 0.5 px off the middle; head is up, the patient's left at the right."""
+    """A point 10 mm off the isocentre is 10 * 1000 / 750 / 0.5 px off the middle; head is up, the patient's left at the
+    right."""
     front, left = (P_of(make(tmp_path / 'run.dcm', BLANK, angle)) for angle in (0, 90))
     middle, step = np.array([4.0, 3.5]), 10 / 750 * 1000 / 0.5
     assert np.allclose(project(front, np.zeros(3)), middle) and np.allclose(project(left, np.zeros(3)), middle)
     assert np.allclose(project(front, np.array([0.01, 0, 0])) - middle, [step, 0])
     assert np.allclose(project(front, np.array([0, 0, 0.01])) - middle, [0, -step])
-    assert np.allclose(project(left, np.array([0, 0.01, 0])) - middle, [step, 0])       # the spine is at the right of LAO views
+    # the spine is at the right of LAO views
+    assert np.allclose(project(left, np.array([0, 0.01, 0])) - middle, [step, 0])
     assert np.allclose(source(front), [0, 0.75, 0]) and np.allclose(source(left), [-0.75, 0, 0])
 
 
@@ -94,11 +97,13 @@ def test_cranial_angles_put_the_source_below_and_pixels_need_not_be_square(tmp_p
 def test_the_patients_orientation_decides_against_the_usual_display(tmp_path):
     P = P_of(make(tmp_path / 'run.dcm', BLANK, PatientOrientation=['R', 'F']))
     assert project(P, np.array([0.01, 0, 0]))[0] < 4 and project(P, np.array([0, 0, 0.01]))[1] < 3.5
-    assert np.allclose(P_of(make(tmp_path / 'run.dcm', BLANK, PatientOrientation=['L', 'F'])), P_of(make(tmp_path / 'run.dcm', BLANK)))
+    assert np.allclose(P_of(make(tmp_path / 'run.dcm', BLANK, PatientOrientation=['L', 'F'])),
+                       P_of(make(tmp_path / 'run.dcm', BLANK)))
 
 
 def test_a_moving_run_has_a_camera_a_frame(tmp_path):
-    moving = dicom.read_run(make(tmp_path / 'run.dcm', np.repeat(BLANK, 2, axis=0), 10.0, PositionerPrimaryAngleIncrement=[0, 5, 10, 10]))
+    moving = dicom.read_run(make(tmp_path / 'run.dcm', np.repeat(BLANK, 2, axis=0), 10.0,
+                                 PositionerPrimaryAngleIncrement=[0, 5, 10, 10]))
     at = [P_of(make(tmp_path / 'still.dcm', BLANK, angle)) for angle in (10, 15, 20, 20)]
     assert all(np.allclose(c.P, P) for c, P in zip(moving.calibrations, at, strict=True))
     assert moving.calibrations[3] is moving.calibrations[2] is not moving.calibrations[1]
@@ -146,14 +151,16 @@ def test_logarithms_become_intensities_by_the_files_own_table(tmp_path):
 def test_a_table_in_bytes(tmp_path):
     path = make(tmp_path / 'run.dcm', np.array([[[0, 3, 200, 255]]], np.uint8), **logarithms())
     header = pydicom.dcmread(path)
-    header.ModalityLUTSequence[0]['LUTData'] = pydicom.DataElement(0x00283006, 'OW', (np.arange(256, dtype='<u2') ** 2).tobytes())
+    header.ModalityLUTSequence[0]['LUTData'] = pydicom.DataElement(0x00283006, 'OW',
+                                                                   (np.arange(256, dtype='<u2') ** 2).tobytes())
     header.save_as(path)
     assert [frame.tolist() for frame in dicom_pixels.pictures(dicom.read_run(path))] == [[[0, 9, 40000, 65025]]]
 
 
 def test_a_table_for_signed_logarithms_begins_below_zero(tmp_path):
     table = logarithms(descriptor=[256, -128, 16])
-    run = dicom.read_run(make(tmp_path / 'run.dcm', np.array([[[-128, -1, 0, 127]]], np.int8), PixelRepresentation=1, **table))
+    run = dicom.read_run(make(tmp_path / 'run.dcm', np.array([[[-128, -1, 0, 127]]], np.int8),
+                              PixelRepresentation=1, **table))
     assert [frame.tolist() for frame in dicom_pixels.pictures(run)] == [[[0, 127**2, 128**2, 255**2]]]
 
 
@@ -165,11 +172,13 @@ def test_a_table_that_can_be_none_is_named(tmp_path, descriptor):
 
 
 @pytest.mark.parametrize('keyword, vr, value', [
-    ('ImageType', 'US', 7), ('PatientOrientation', 'FD', [1.0, 2.0]), ('FrameIncrementPointer', 'LO', 'FrameTime'), ('FrameIncrementPointer', 'AT', [0x00181063] * 2),
-    ('ModalityLUTSequence', 'LO', 'abc'), ('PixelIntensityRelationship', 'US', 3), ('PhotometricInterpretation', 'CS', ['MONOCHROME1', 'RGB']),
-    ('NumberOfFrames', 'FD', float('nan')), ('PositionerPrimaryAngle', 'FD', float('inf')), ('FrameTime', 'FD', 1e300), ('BitsStored', 'FD', 0.5),
-    ('PhotometricInterpretation', 'LO', 'GREY\x1b[2J'), ('PixelRepresentation', 'LO', 'maybe'), ('HighBit', 'SS', -1), ('SamplesPerPixel', 'LO', 'one'),
-    ('CineRate', 'FD', 1e-320)])
+    ('ImageType', 'US', 7), ('PatientOrientation', 'FD', [1.0, 2.0]), ('FrameIncrementPointer', 'LO', 'FrameTime'),
+    ('FrameIncrementPointer', 'AT', [0x00181063] * 2), ('ModalityLUTSequence', 'LO', 'abc'),
+    ('PixelIntensityRelationship', 'US', 3), ('PhotometricInterpretation', 'CS', ['MONOCHROME1', 'RGB']),
+    ('NumberOfFrames', 'FD', float('nan')), ('PositionerPrimaryAngle', 'FD', float('inf')), ('FrameTime', 'FD', 1e300),
+    ('BitsStored', 'FD', 0.5),
+    ('PhotometricInterpretation', 'LO', 'GREY\x1b[2J'), ('PixelRepresentation', 'LO', 'maybe'), ('HighBit', 'SS', -1),
+    ('SamplesPerPixel', 'LO', 'one'), ('CineRate', 'FD', 1e-320)])
 def test_attributes_of_another_kind_are_read_or_named(tmp_path, keyword, vr, value):
     """A file says of what kind its values are; `LOG` has a table looked for."""
     path = make(tmp_path / 'run.dcm', BLANK, PixelIntensityRelationship='LOG')
@@ -184,7 +193,8 @@ def test_attributes_of_another_kind_are_read_or_named(tmp_path, keyword, vr, val
         assert str(error).isprintable()
 
 
-@pytest.mark.parametrize('keyword', ['SOPClassUID', 'ImageType', 'Rows', 'PatientOrientation', 'PixelIntensityRelationship'])
+@pytest.mark.parametrize('keyword', ['SOPClassUID', 'ImageType', 'Rows', 'PatientOrientation',
+                                     'PixelIntensityRelationship'])
 def test_a_sequence_for_a_value_is_named(files, capsys, keyword):
     header = pydicom.dcmread('a.dcm')
     header[keyword] = pydicom.DataElement(pydicom.tag.Tag(keyword), 'SQ', [pydicom.Dataset()])
@@ -218,10 +228,12 @@ def test_imported_runs_replay_to_the_device(files, capsys):
     assert importer.main(['--dicom', 'b.dcm', 'a.dcm', '--out', 'out']) == 0      # the files say which is which
     assert '2 pairs in out' in capsys.readouterr().out
     bag = read()
-    assert [stamp_ns(m) for m in bag['/plane_a/image_raw']] == [10**9, 1_100_000_000] == [stamp_ns(m) for m in bag['/plane_b/camera_info']]
+    assert ([stamp_ns(m) for m in bag['/plane_a/image_raw']] == [10**9, 1_100_000_000]
+            == [stamp_ns(m) for m in bag['/plane_b/camera_info']])
     assert np.array_equal(image_to_array(bag['/plane_a/image_raw'][0]), PAIR[0][0])
     base = 'base_position=[{:.4f},{:.4f},{:.4f}]'.format(*curve()[0])
-    assert replay.main(['out', '--out', 'results', '-p', 'robot_radius=0.001', '-p', base, '-p', 'reference_frame=isocentre']) == 0
+    assert replay.main(['out', '--out', 'results', '-p', 'robot_radius=0.001', '-p', base, '-p',
+                        'reference_frame=isocentre']) == 0
     paths = read('results')['/backbone']
     assert len(paths) == 2 and paths[0].header.frame_id == 'isocentre'
     assert cKDTree(curve()).query(path_to_points(paths[0]))[0].max() < 0.004
@@ -237,8 +249,9 @@ def test_a_moving_run_sends_camera_infos_anew(tmp_path, monkeypatch):
 
 
 def test_nothing_tells_whose_images_they_are(files):
-    done = subprocess.run([sys.executable, '-c', f'import sys\nsys.path[:0] = {[p for p in sys.path if p]!r}\nfrom fluoro_shape_ros.files.importer import main\n'
-                           'sys.exit(main())', '--dicom', 'a.dcm', 'b.dcm', '--out', 'out'], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, '-c', f'import sys\nsys.path[:0] = {[p for p in sys.path if p]!r}\nfrom '
+                                                 'fluoro_shape_ros.files.importer import main\n' 'sys.exit(main())',
+                           '--dicom', 'a.dcm', 'b.dcm', '--out', 'out'], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     written = b''.join(p.read_bytes() for p in (files / 'out').iterdir()) + (done.stdout + done.stderr).encode()
     for word in map(str.encode, PERSON.values()):
@@ -246,7 +259,8 @@ def test_nothing_tells_whose_images_they_are(files):
 
 
 @pytest.mark.parametrize('attributes, says', [
-    (dict(Rows=8000, Columns=8000, NumberOfFrames=1000), 'truncated: 1000 frames of 8000x8000 px need 128000000000 bytes, the file has'),
+    (dict(Rows=8000, Columns=8000, NumberOfFrames=1000),
+     'truncated: 1000 frames of 8000x8000 px need 128000000000 bytes, the file has'),
     (dict(Rows=60000), 'Rows must be one number in [1, 8192]'),
     (dict(DistanceSourceToDetector=None), 'DistanceSourceToDetector is missing'),
     (dict(DistanceSourceToPatient=1200.0), 'is not in front of the detector'),
@@ -319,7 +333,8 @@ def test_filled_up_markers_are_skipped():
 
 def test_more_than_a_file_can_hold_is_refused(files, capsys):
     make('a.dcm', PAIR[0], syntax=JPEGBaseline8Bit, pixel_data=encapsulate([b'12345678'] * 2), Rows=8192, Columns=8192)
-    assert '2 frames of 8192x8192 px are more than 1000 times as large as the file' in (said := refused(capsys, 'a.dcm', 'b.dcm')) or 'needs one of' in said
+    assert ('2 frames of 8192x8192 px are more than 1000 times as large as the file'
+            in (said := refused(capsys, 'a.dcm', 'b.dcm')) or 'needs one of' in said)
 
 
 def test_garbage_never_ends_in_another_error(tmp_path):

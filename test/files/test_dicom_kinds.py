@@ -1,4 +1,5 @@
-"""What DICOM files leave out, say twice or say otherwise: each kind made here, with cameras, times and pixels worked out by hand."""
+"""What DICOM files leave out, say twice or say otherwise: each kind made here, with cameras, times and pixels worked
+out by hand."""
 
 from pathlib import Path
 
@@ -65,7 +66,8 @@ def read(path='out'):
 @pytest.mark.parametrize('attributes, spacing, says', [
     (dict(FieldOfViewDimensions=[4, 5]), 0.5, '0.5 mm is what the field of view of 4 x 5 mm gives'),
     (dict(FieldOfViewDimensions=[5, 4]), 0.5, '0.5 mm'),        # whichever of them is the height: pixels are square
-    (dict(PixelSpacing=[0.3, 0.3], EstimatedRadiographicMagnificationFactor=1.5), 0.45, 'PixelSpacing magnified 1.5 times'),
+    (dict(PixelSpacing=[0.3, 0.3], EstimatedRadiographicMagnificationFactor=1.5), 0.45,
+     'PixelSpacing magnified 1.5 times'),
     (dict(PixelSpacing=[0.3, 0.3]), 0.3 * SID / SOD, 'PixelSpacing magnified 1.33 times'),      # to the isocentre
 ])
 def test_what_a_pixel_measures_where_that_is_not_said_outright(attributes, spacing, says):
@@ -75,18 +77,21 @@ def test_what_a_pixel_measures_where_that_is_not_said_outright(attributes, spaci
 
 
 def test_a_round_field_of_a_square_image():
-    run = dicom.read_run(make('run.dcm', np.zeros((2, 8, 8), np.uint8), ImagerPixelSpacing=None, FieldOfViewShape='ROUND', FieldOfViewDimensions=[16]))
+    run = dicom.read_run(make('run.dcm', np.zeros((2, 8, 8), np.uint8), ImagerPixelSpacing=None,
+                              FieldOfViewShape='ROUND', FieldOfViewDimensions=[16]))
     assert run.calibrations[0].K[1, 1] == pytest.approx(SID / 2)
 
 
-@pytest.mark.parametrize('attributes', [{}, dict(FieldOfViewDimensions=[16]), dict(FieldOfViewDimensions=[4, 9]), dict(FieldOfViewDimensions=[4, 5, 6])])
+@pytest.mark.parametrize('attributes', [{}, dict(FieldOfViewDimensions=[16]), dict(FieldOfViewDimensions=[4, 9]),
+                                        dict(FieldOfViewDimensions=[4, 5, 6])])
 def test_a_field_whose_pixels_would_not_be_square_tells_nothing(attributes):
     with pytest.raises(BadDicom, match='ImagerPixelSpacing must be two .* --pixel-spacing'):
         focal(**attributes)
 
 
 def test_the_magnification_tells_where_the_isocentre_is():
-    run = dicom.read_run(make('run.dcm', FRAMES, DistanceSourceToPatient=None, EstimatedRadiographicMagnificationFactor=1.25))
+    run = dicom.read_run(make('run.dcm', FRAMES, DistanceSourceToPatient=None,
+                              EstimatedRadiographicMagnificationFactor=1.25))
     assert np.allclose(run.calibrations[0].P[2], [0, -1, 0, SID / 1.25 / 1e3])      # the last row of P is the depth
 
 
@@ -107,7 +112,8 @@ def test_pixel_spacing_from_the_command_line(capsys):
 
 def test_own_calibrations_with_the_pixels_of_dicom(capsys):
     """Of the files nothing but pixels, times and the letter of the plane is needed."""
-    bare = dict(ImagerPixelSpacing=None, DistanceSourceToDetector=None, DistanceSourceToPatient=None, PositionerPrimaryAngle=None)
+    bare = dict(ImagerPixelSpacing=None, DistanceSourceToDetector=None, DistanceSourceToPatient=None,
+                PositionerPrimaryAngle=None)
     for p, other, pixels, P in zip('ab', 'ba', GOOD, VIEWS):        # a.dcm is of plane B
         make(f'{other}.dcm', np.stack([pixels] * 2), ImageType=['ORIGINAL', 'PRIMARY', f'BIPLANE {p.upper()}'], **bare)
         write_calibration(f'{p}.yaml', Calibration(f'plane_{p}', SIZE, SIZE, K, P, 'plumb_bob', np.zeros(5)))
@@ -124,10 +130,12 @@ def test_own_calibrations_with_the_pixels_of_dicom(capsys):
 # ---- pixels
 
 
-@pytest.mark.parametrize('kind, shape, turned', [('MONOCHROME2', 'IDENTITY', False), ('MONOCHROME2', 'INVERSE', True), ('MONOCHROME1', 'INVERSE', True),
+@pytest.mark.parametrize('kind, shape, turned', [('MONOCHROME2', 'IDENTITY', False), ('MONOCHROME2', 'INVERSE', True),
+                                                 ('MONOCHROME1', 'INVERSE', True),
                                                  ('MONOCHROME1', None, True), ('MONOCHROME1', 'IDENTITY', True)])
 def test_white_for_black_by_either_name_is_turned_over_once(kind, shape, turned):
-    assert values(make('run.dcm', BYTES, PhotometricInterpretation=kind, PresentationLUTShape=shape)) == ([248, 247, 246] if turned else [7, 8, 9])
+    assert (values(make('run.dcm', BYTES, PhotometricInterpretation=kind, PresentationLUTShape=shape))
+            == ([248, 247, 246] if turned else [7, 8, 9]))
 
 
 def jpegs(count=3):
@@ -137,7 +145,8 @@ def jpegs(count=3):
 @pytest.mark.parametrize('table', [False, True])
 def test_an_empty_last_fragment_is_no_frame(table):
     whole = encapsulate(jpegs(), has_bot=table)
-    assert values(make('run.dcm', BYTES, syntax=JPEGBaseline8Bit, pixel_data=whole + b'\xfe\xff\x00\xe0' + bytes(4))) == [7, 8, 9]
+    assert (values(make('run.dcm', BYTES, syntax=JPEGBaseline8Bit, pixel_data=whole + b'\xfe\xff\x00\xe0' + bytes(4)))
+            == [7, 8, 9])
     header = pydicom.dcmread(make('run.dcm', BYTES))
     header.compress(RLELossless)
     header.PixelData += b'\xfe\xff\x00\xe0' + bytes(4)
@@ -146,7 +155,8 @@ def test_an_empty_last_fragment_is_no_frame(table):
 
 
 def test_frames_in_several_fragments():
-    assert values(make('run.dcm', BYTES, syntax=JPEGBaseline8Bit, pixel_data=encapsulate(jpegs(), fragments_per_frame=3, has_bot=False))) == [7, 8, 9]
+    assert values(make('run.dcm', BYTES, syntax=JPEGBaseline8Bit,
+                       pixel_data=encapsulate(jpegs(), fragments_per_frame=3, has_bot=False))) == [7, 8, 9]
 
 
 def test_a_compressed_run_that_is_cut_off_is_refused():
@@ -171,7 +181,8 @@ def test_more_frames_than_are_announced_are_said(capsys, count, says, compressed
 def test_fewer_frames_than_are_announced_are_refused_in_one_line(capsys):
     make('a.dcm', BYTES, NumberOfFrames=5, syntax=JPEGBaseline8Bit, pixel_data=encapsulate(jpegs()))
     make('b.dcm', BYTES, 90.0)
-    assert 'a.dcm: truncated: NumberOfFrames is 5, of which 3 are there' in imported(capsys, '--dicom', 'a.dcm', 'b.dcm', code=1)
+    assert 'a.dcm: truncated: NumberOfFrames is 5, of which 3 are there' in imported(capsys, '--dicom', 'a.dcm',
+                                                                                     'b.dcm', code=1)
 
 
 @pytest.mark.parametrize('syntax', [None, ImplicitVRLittleEndian])
@@ -184,7 +195,8 @@ def test_files_without_preamble(syntax):
     bare = pydicom.dcmread('whole.dcm')
     length = bare.file_meta.FileMetaInformationGroupLength
     Path('run.dcm').write_bytes(data[144 + length:])
-    assert values('run.dcm') == [7, 8, 9] and np.allclose(dicom.read_run('run.dcm').calibrations[0].P, dicom.read_run('whole.dcm').calibrations[0].P)
+    assert values('run.dcm') == [7, 8, 9] and np.allclose(dicom.read_run('run.dcm').calibrations[0].P,
+                                                          dicom.read_run('whole.dcm').calibrations[0].P)
 
 
 def test_a_transfer_syntax_that_is_written_as_a_text():
@@ -215,7 +227,8 @@ def test_runs_of_other_rates_pair_by_their_times_and_it_is_said(capsys):
     make('b.dcm', BYTES, 90.0, FrameTime=1000 / 15)
     out = imported(capsys, '--dicom', 'a.dcm', 'b.dcm')
     assert out.startswith('3 pairs in out\n')
-    assert out.splitlines()[-1] == 'plane A has 6 images at 30/s and plane B has 3 images at 15/s: 3 have no partner within 10 ms'
+    assert (out.splitlines()[-1] == 'plane A has 6 images at 30/s and plane B has 3 images at 15/s: '
+                                    '3 have no partner within 10 ms')
 
 
 def test_a_guessed_rate_is_said(capsys):
@@ -233,7 +246,8 @@ def test_a_guessed_rate_is_said(capsys):
 
 def test_the_functional_groups_of_enhanced_xa(capsys):
     """It says of every frame what a classic image says of them all: the same cameras."""
-    run = dicom.read_run(enhanced('run.dcm', FRAMES, [0.0, 10.0, 10.0], [0.1, 0.2, 0.35], PlaneIdentification='PLANE B'))
+    run = dicom.read_run(enhanced('run.dcm', FRAMES, [0.0, 10.0, 10.0], [0.1, 0.2, 0.35],
+                                  PlaneIdentification='PLANE B'))
     assert (run.plane, run.count) == ('b', 3) and run.calibrations[1] is run.calibrations[2]
     for angle, camera in zip((0.0, 10.0), run.calibrations):
         assert np.allclose(camera.P, dicom.read_run(make('classic.dcm', FRAMES, angle)).calibrations[0].P)
@@ -255,7 +269,8 @@ def test_a_field_of_view_of_enhanced_xa():
     assert run.calibrations[0].K[1, 1] == pytest.approx(SID / PITCH) and run.times_ns is None and len(run.notes) == 1
 
 
-@pytest.mark.parametrize('angles, says', [([0.0, 1.0], 'functional groups are for 2 frames, but there are 3'), ([0.0, 1.0, None], 'PositionerPrimaryAngle is missing')])
+@pytest.mark.parametrize('angles, says', [([0.0, 1.0], 'functional groups are for 2 frames, but there are 3'),
+                                          ([0.0, 1.0, None], 'PositionerPrimaryAngle is missing')])
 def test_functional_groups_that_do_not_do_are_named(angles, says):
     with pytest.raises(BadDicom, match=says):
         dicom.read_run(enhanced('run.dcm', FRAMES, angles))

@@ -70,7 +70,8 @@ def test_a_folder_with_nothing_in_it_is_named():
 def imagej(path, stack, big=True, announced=None):
     """A stack as ImageJ writes those beyond 4 GB: one directory, and the images one after the other."""
     count = announced or len(stack)
-    tifffile.imwrite(path, stack[0], byteorder='>' if big else '<', description=f'ImageJ=1.54f\nimages={count}\nslices={count}\n', metadata=None)
+    tifffile.imwrite(path, stack[0], byteorder='>' if big else '<',
+                     description=f'ImageJ=1.54f\nimages={count}\nslices={count}\n', metadata=None)
     with open(path, 'ab') as file:
         file.write(stack[1:].astype(stack.dtype.newbyteorder('>' if big else '<')).tobytes())
     with tifffile.TiffFile(path) as tiff:       # the first image must be the last thing in the file
@@ -120,7 +121,8 @@ def test_min_is_white_is_turned_over_whatever_the_depth(dtype, full, compression
 
 
 def test_min_is_white_in_a_stack_with_one_directory():
-    tifffile.imwrite('white.tif', STACK[0], photometric='miniswhite', description='ImageJ=1.54f\nimages=2\n', metadata=None)
+    tifffile.imwrite('white.tif', STACK[0], photometric='miniswhite', description='ImageJ=1.54f\nimages=2\n',
+                     metadata=None)
     with open('white.tif', 'ab') as file:
         file.write(STACK[1].tobytes())
     assert np.array_equal(images('white.tif'), 65535 - STACK[:2])

@@ -38,7 +38,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def arguments(*more, plane_a=('a',), plane_b=('b',)):
-    return ['--plane-a', *plane_a, '--plane-b', *plane_b, '--camera-a', 'a.yaml', '--camera-b', 'b.yaml', '--out', 'out', *more]
+    return ['--plane-a', *plane_a, '--plane-b', *plane_b, '--camera-a', 'a.yaml', '--camera-b', 'b.yaml', '--out',
+            'out', *more]
 
 
 def read(path='out'):
@@ -110,7 +111,8 @@ def test_videos_bring_their_rate(folder, capsys):
 
 def test_a_rate_that_nobody_told_is_said(folder, capsys):
     assert importer.main(arguments()) == 0
-    assert capsys.readouterr().out.splitlines() == ['2 pairs in out', 'no file tells the rate: 15 images/s are a guess; --rate or --stamps says it']
+    assert (capsys.readouterr().out.splitlines()
+            == ['2 pairs in out', 'no file tells the rate: 15 images/s are a guess; --rate or --stamps says it'])
     assert importer.main(arguments('--rate', '15', '--out', 'other')) == 0
     assert capsys.readouterr().out == '2 pairs in other\n'
 
@@ -123,8 +125,10 @@ def test_what_a_shell_makes_of_a_pattern_comes_in_the_order_of_its_numbers(folde
 def test_another_order_than_that_of_the_numbers_is_said(folder, capsys):
     (folder / 'a' / 'frame1.png').write_bytes((folder / 'a' / 'frame10.png').read_bytes())
     names = ['a/frame2.png', 'a/frame10.png', 'a/frame1.png']       # as no shell sorts
-    assert importer.main(arguments('--rate', '15', plane_a=names, plane_b=['b/frame2.png', 'b/frame10.png', 'b/frame10.png'])) == 0
-    assert capsys.readouterr().out.splitlines()[1:] == ['plane A: its images are taken in the order given, which is not that of the numbers in their names']
+    assert importer.main(arguments('--rate', '15', plane_a=names,
+                                   plane_b=['b/frame2.png', 'b/frame10.png', 'b/frame10.png'])) == 0
+    assert (capsys.readouterr().out.splitlines()[1:]
+            == ['plane A: its images are taken in the order given, which is not that of the numbers in their names'])
     assert [image_to_array(m)[0, 0] for _, m in read()['/plane_a/image_raw']] == [2, 10, 10]
 
 
@@ -160,7 +164,8 @@ def test_what_can_not_work_is_said_in_one_line(folder, capsys):
     assert 'none.yaml' in refused(capsys, '--camera-a', 'none.yaml')
     assert 'text.png: no calibration' in refused(capsys, '--camera-a', 'text.png')
     assert 'camera_name "plane_b" was given for plane A' in refused(capsys, '--camera-a', 'b.yaml')
-    (folder / 'unnamed.yaml').write_text((folder / 'b.yaml').read_text().replace('camera_name: plane_b', 'camera_name: detector'))
+    (folder / 'unnamed.yaml').write_text((folder / 'b.yaml').read_text().replace('camera_name: plane_b',
+                                                                                 'camera_name: detector'))
     assert 'coincide' in refused(capsys, '--camera-a', 'unnamed.yaml')
     assert 'a exists already' in refused(capsys, '--out', 'a')
     assert not (folder / 'out').exists()
@@ -171,18 +176,22 @@ def test_a_stereo_pair_in_one_file_without_its_size_in_millimetres(folder, capsy
     poses = [np.vstack([np.linalg.solve(c.K, c.P), [0, 0, 0, 1]]) for c in CALIBRATIONS]
     b_from_a = poses[1] @ np.linalg.inv(poses[0])
     K = CALIBRATIONS[0].K
-    np.savez('stereo.npz', mtxL=K, distL=np.zeros(5), mtxR=K, distR=np.zeros(5), R=b_from_a[:3, :3], T=1e3 * b_from_a[:3, 3])
+    np.savez('stereo.npz', mtxL=K, distL=np.zeros(5), mtxR=K, distR=np.zeros(5), R=b_from_a[:3, :3],
+             T=1e3 * b_from_a[:3, 3])
     assert importer.main(arguments('--camera-a', 'stereo.npz', '--camera-b', 'stereo.npz', '--rate', '15')) == 0
-    assert capsys.readouterr().out.splitlines() == ['2 pairs in out', 'the calibrations are in mm, as a source stands 1131 from the origin; --unit says otherwise']
+    assert capsys.readouterr().out.splitlines() == ['2 pairs in out', 'the calibrations are in mm, as a source stands '
+                                                                      '1131 from the origin; --unit says otherwise']
     info = read()['/plane_b/camera_info'][0][1]
     assert (info.width, info.height) == (SIZE, SIZE) and np.allclose(info.p.reshape(3, 4), K @ b_from_a[:3])
 
 
 @pytest.mark.parametrize('unit, metres', [('m', 1e3), ('mm', 1e-3)])
 def test_calibrations_that_are_not_in_metres_are_said(folder, capsys, unit, metres):
-    """A device of 1.2 mm is 1.2 px wide here. Lengths a thousand times as long, or a thousandth, make that 1/1000, or 1200."""
+    """A device of 1.2 mm is 1.2 px wide here. Lengths a thousand times as long, or a thousandth, make that 1/1000, or
+    1200."""
     for p, c in zip('ab', CALIBRATIONS):
-        write_calibration(f'{p}.yaml', Calibration(c.camera_name, SIZE, SIZE, c.K, c.P * [1, 1, 1, 1e3 if unit == 'm' else 1]))
+        write_calibration(f'{p}.yaml', Calibration(c.camera_name, SIZE, SIZE, c.K,
+                                                   c.P * [1, 1, 1, 1e3 if unit == 'm' else 1]))
     assert importer.main(arguments('--unit', unit, '--rate', '15')) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 2 and said[1].endswith('px wide where the planes look: are the calibrations in metres?')
@@ -192,8 +201,10 @@ def test_calibrations_that_are_not_in_metres_are_said(folder, capsys, unit, metr
 @pytest.mark.parametrize('name, plane', [('plane_b', 'a'), ('PLANE A', 'b'), ('biplane_b_optical', 'a'), ('a', 'b')])
 def test_names_that_contradict_are_refused(folder, capsys, name, plane):
     """A calibration, or a frame, of the other plane."""
-    (folder / 'c.yaml').write_text((folder / f'{plane}.yaml').read_text().replace(f'camera_name: plane_{plane}', f'camera_name: {name}'))
-    assert f'camera_name "{name}" was given for plane {plane.upper()}: are the planes exchanged?' in refused(capsys, f'--camera-{plane}', 'c.yaml')
+    (folder / 'c.yaml').write_text((folder / f'{plane}.yaml').read_text().replace(f'camera_name: plane_{plane}',
+                                                                                  f'camera_name: {name}'))
+    assert (f'camera_name "{name}" was given for plane {plane.upper()}: are the planes exchanged?'
+            in refused(capsys, f'--camera-{plane}', 'c.yaml'))
     frames = ['left', 'right']
     frames['ab'.index(plane)] = name
     assert f'frame_id "{name}" was given for plane {plane.upper()}' in refused(capsys, '--frame-ids', *frames)
@@ -202,7 +213,8 @@ def test_names_that_contradict_are_refused(folder, capsys, name, plane):
 
 @pytest.mark.parametrize('name', ['', 'detector', 'airplane_b', 'cab', 'plane_1', 'narrow_stereo/left', 'plane_a', 'A'])
 def test_names_that_tell_no_other_plane_pass(folder, name):
-    (folder / 'c.yaml').write_text((folder / 'a.yaml').read_text().replace('camera_name: plane_a', f'camera_name: "{name}"'))
+    (folder / 'c.yaml').write_text((folder / 'a.yaml').read_text().replace('camera_name: plane_a',
+                                                                           f'camera_name: "{name}"'))
     assert importer.main(arguments('--camera-a', 'c.yaml')) == 0
 
 
@@ -211,7 +223,8 @@ def test_a_calibration_that_is_no_camera_is_refused(folder, capsys):
     assert 'plane a: P is zero' in refused(capsys)
 
 
-@pytest.mark.parametrize('text, says', [('1\none', 'line 2: "one" is no time'), ('2\n1', 'line 2: 1 s: stamps must be positive and increase'),
+@pytest.mark.parametrize('text, says', [('1\none', 'line 2: "one" is no time'),
+                                        ('2\n1', 'line 2: 1 s: stamps must be positive and increase'),
                                         ('0', 'line 1: 0 s'), ('nan', 'line 1'), ('1e30', 'line 1'), ('-1', 'line 1')])
 def test_bad_stamps_are_named(tmp_path, text, says):
     (tmp_path / 'stamps').write_text(text)
@@ -226,11 +239,13 @@ def process(*given, code=None):
 
 def test_as_a_process_without_ros(folder):
     # from another working directory than the source's: so that the child finds the package
-    code = (f'import sys\nsys.path[:0] = {[p for p in sys.path if p]!r}\nfor name in ("rclpy", "sensor_msgs", "std_msgs"): sys.modules[name] = None\n'
+    code = (f'import sys\nsys.path[:0] = {[p for p in sys.path if p]!r}\n'
+            'for name in ("rclpy", "sensor_msgs", "std_msgs"): sys.modules[name] = None\n'
             'from fluoro_shape_ros.files.importer import main\nsys.exit(main())')
     done = process(*arguments(), code=code)
     assert done.returncode == 0 and done.stderr.splitlines() == [
-        'results will be in the frame of the calibrations: name it, fluoro_shape_replay out --out results -p reference_frame=isocenter']
+        'results will be in the frame of the calibrations: name it, fluoro_shape_replay out --out results -p '
+        'reference_frame=isocenter']
     assert len(read()['/plane_a/image_raw']) == 2
 
 

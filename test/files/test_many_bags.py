@@ -38,24 +38,28 @@ def cells(line):
 
 
 def test_a_bag_that_fails_stops_no_other(folder, capsys):
-    assert main('one', 'none', 'three', 'two', '--out', 'out', '--jobs', 2, '--csv', 'tip.csv', '--npz', 'arrays.npz') == 1
+    assert main('one', 'none', 'three', 'two', '--out', 'out', '--jobs', 2, '--csv', 'tip.csv', '--npz',
+                'arrays.npz') == 1
     said = capsys.readouterr()
     assert said.err.splitlines() == ['fluoro_shape_replay: 2 of 4 bags failed: none, three']
     head, one, none, three, two, all_ = said.out.splitlines()
     assert cells(head)[:4] == ['bag', 'pairs', 'answered', 'refused']
     assert cells(one) == ['one', '2', '1', '1', 'no_device_in_plane_a'] and cells(two) == ['two', '1', '1', '0']
-    assert cells(none)[:4] == ['none', '0', '0', '0'] and 'no such bag' in none and 'three: can\'t be read as a bag' in three
+    assert (cells(none)[:4] == ['none', '0', '0', '0'] and 'no such bag' in none
+            and 'three: can\'t be read as a bag' in three)
     assert cells(all_) == ['all', '3', '2', '1', '2', 'of', '4', 'failed']
-    assert list(outcomes(folder / 'out' / 'one').values()) == ['ok', 'no_device_in_plane_a'] and list(outcomes(folder / 'out' / 'two').values()) == ['ok']
-    assert sorted(p.name for p in (folder / 'out').iterdir()) == ['one', 'one_arrays.npz', 'one_tip.csv', 'two', 'two_arrays.npz', 'two_tip.csv']
+    assert (list(outcomes(folder / 'out' / 'one').values()) == ['ok', 'no_device_in_plane_a']
+            and list(outcomes(folder / 'out' / 'two').values()) == ['ok'])
+    assert sorted(p.name for p in (folder / 'out').iterdir()) == ['one', 'one_arrays.npz', 'one_tip.csv', 'two',
+                                                                  'two_arrays.npz', 'two_tip.csv']
 
 
 def test_the_same_as_one_by_one(folder):
     assert main('one', 'two', '--out', 'out') == 0
     (folder / 'alone').mkdir()
     # in a process of its own too: with more threads, which a test's process may have, BLAS rounds otherwise
-    subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.files.replay', 'one', '--out', 'alone/one', '-p', RADIUS], check=True,
-                   env={**os.environ, 'PYTHONPATH': ':'.join(filter(None, sys.path))})
+    subprocess.run([sys.executable, '-m', 'fluoro_shape_ros.files.replay', 'one', '--out', 'alone/one', '-p', RADIUS],
+                   check=True, env={**os.environ, 'PYTHONPATH': ':'.join(filter(None, sys.path))})
     first, second = ({p.name: p.read_bytes() for p in (folder / path / 'one').iterdir()} for path in ('out', 'alone'))
     assert first == second
 
@@ -69,8 +73,10 @@ def test_by_the_workers_of_a_scheduler(folder, tmp_path_factory, capsys):
     finally:
         cluster.end()
     said = capsys.readouterr()
-    assert said.err.splitlines() == ['fluoro_shape_replay: 1 of 3 bags failed: none'] and 'none: no such bag' in said.out
-    assert list(outcomes(folder / 'out' / 'one').values()) == ['ok', 'no_device_in_plane_a'] and list(outcomes(folder / 'out' / 'two').values()) == ['ok']
+    assert (said.err.splitlines() == ['fluoro_shape_replay: 1 of 3 bags failed: none']
+            and 'none: no such bag' in said.out)
+    assert (list(outcomes(folder / 'out' / 'one').values()) == ['ok', 'no_device_in_plane_a']
+            and list(outcomes(folder / 'out' / 'two').values()) == ['ok'])
 
 
 def test_what_can_not_work_is_said_once(folder, capsys):
@@ -83,7 +89,7 @@ def test_what_can_not_work_is_said_once(folder, capsys):
     assert 'one was given twice' in capsys.readouterr().err
     assert main('one', 'two', '--out', 'none/out') == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
-    assert main('one', 'two', '--out', 'out') == 0 and main('one', 'two', '--out', 'out') == 1     # nothing is overwritten
+    assert main('one', 'two', '--out', 'out') == 0 and main('one', 'two', '--out', 'out') == 1  # nothing is overwritten
     assert 'out/one exists already' in capsys.readouterr().out
 
 
@@ -91,7 +97,8 @@ def test_names_tell_all_bags_apart(tmp_path):
     for name in ('monday/run', 'tuesday/run', 'tuesday/run_2026_01_02-10.11.12'):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / 'tuesday' / 'last.mcap').touch()
-    given = [str(tmp_path / name) for name in ('monday/run', 'tuesday/run', 'tuesday/run_2026_01_02-10.11.12', 'tuesday/last.mcap')]
+    given = [str(tmp_path / name) for name in ('monday/run', 'tuesday/run', 'tuesday/run_2026_01_02-10.11.12',
+                                               'tuesday/last.mcap')]
     assert many.names_of(given[1:]) == ['run', 'run_2026_01_02-10.11.12', 'last']
     assert many.names_of(given) == ['monday_run', 'tuesday_run', 'tuesday_run_2026_01_02-10.11.12', 'tuesday_last']
     with pytest.raises(ToolError, match='run was given twice'):
@@ -104,7 +111,8 @@ def test_one_bag_says_in_words_why_pairs_were_refused(folder, capsys):
     at = lines.index('      1  no_device_in_plane_a')
     assert lines[at + 1].startswith(' ' * 12 + '1  ') and len(lines[at + 1].split()) > 3
     counted = json.loads((folder / 'out.json').read_text())
-    assert counted['outcomes'] == {'ok': 1, 'no_device_in_plane_a': 1} and counted['pairs'] == 2 and counted['images'] == {'a': 2, 'b': 2}
+    assert (counted['outcomes'] == {'ok': 1, 'no_device_in_plane_a': 1} and counted['pairs'] == 2
+            and counted['images'] == {'a': 2, 'b': 2})
     assert counted['reasons'][0]['outcome'] == 'no_device_in_plane_a' and counted['reasons'][0]['pairs'] == 1
 
 
@@ -112,8 +120,10 @@ def test_ctrl_c_keeps_what_is_done(folder):
     """The table comes nevertheless, with what was at work and what was not begun."""
     for name in 'xyz':
         record(folder / name, [GOOD] * 40)
-    process = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.files.replay', 'two', 'x', 'y', 'z', '--out', 'out', '-p', RADIUS], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True, env={**os.environ, 'PYTHONPATH': ':'.join(filter(None, sys.path))})
+    process = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.files.replay', 'two',
+                                'x', 'y', 'z', '--out', 'out', '-p', RADIUS],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               env={**os.environ, 'PYTHONPATH': ':'.join(filter(None, sys.path))})
     looked = threading.Event()
     try:
         deadline = time.monotonic() + 60

@@ -1,4 +1,5 @@
-"""One table of parameter files, read by a real rclpy node and by the replay: what one takes, and what one refuses, the other does, too."""
+"""One table of parameter files, read by a real rclpy node and by the replay: what one takes, and what one refuses, the
+other does, too."""
 
 import pytest
 
@@ -19,9 +20,12 @@ def own(*lines):
 
 CASES = {   # name -> text of the file, and the parameters that are not at their default
     'all and own': (section('/**', 'spacing_px: 2.0') + own('spacing_px: 3.0'), dict(spacing_px=3.0)),
-    'own and all': (own('spacing_px: 3.0', 'min_length_px: 7.0') + section('/**', 'spacing_px: 2.0'), dict(spacing_px=2.0, min_length_px=7.0)),
-    'all, own, all': (section('/**', 'spacing_px: 2.0') + own('spacing_px: 3.0') + section('/**', 'spacing_px: 4.0', 'threads: 3'), dict(spacing_px=3.0, threads=3)),
-    'own, all, own': (own('spacing_px: 3.0') + section('/**', 'spacing_px: 2.0') + own('threads: 3', 'spacing_px: 5.0'), dict(spacing_px=2.0, threads=3)),
+    'own and all': (own('spacing_px: 3.0', 'min_length_px: 7.0') + section('/**', 'spacing_px: 2.0'),
+                    dict(spacing_px=2.0, min_length_px=7.0)),
+    'all, own, all': (section('/**', 'spacing_px: 2.0') + own('spacing_px: 3.0')
+                      + section('/**', 'spacing_px: 4.0', 'threads: 3'), dict(spacing_px=3.0, threads=3)),
+    'own, all, own': (own('spacing_px: 3.0') + section('/**', 'spacing_px: 2.0') + own('threads: 3', 'spacing_px: 5.0'),
+                      dict(spacing_px=2.0, threads=3)),
     'own twice': (own('spacing_px: 3.0') + own('spacing_px: 4.0'), dict(spacing_px=4.0)),
     'with a slash last': (own('spacing_px: 3.0') + section('/fluoro_shape', 'spacing_px: 4.0'), dict(spacing_px=4.0)),
     'with a slash first': (section('/fluoro_shape', 'spacing_px: 4.0') + own('spacing_px: 3.0'), dict(spacing_px=3.0)),
@@ -30,15 +34,20 @@ CASES = {   # name -> text of the file, and the parameters that are not at their
     'stars without a slash': (section('"**"', 'spacing_px: 2.0'), dict(spacing_px=2.0)),
     'any namespace': (section('/**/fluoro_shape', 'spacing_px: 2.0'), dict(spacing_px=2.0)),
     'any namespace, any name': (section('/**/*', 'spacing_px: 2.0'), dict(spacing_px=2.0)),
-    'another node beside it': (own('spacing_px: 3.0') + section('driver', 'spacing_px: 2.0', 'x: [1]'), dict(spacing_px=3.0)),
-    'a namespace is another node': (own('threads: 3') + section('/lab/fluoro_shape', 'spacing_px: 2.0'), dict(threads=3)),
-    'a namespace by nesting is another node': (own('threads: 3') + 'lab:\n  fluoro_shape:\n    ros__parameters:\n      spacing_px: 2.0\n', dict(threads=3)),
-    'one name before it is another node': (own('threads: 3') + section('/*/fluoro_shape', 'spacing_px: 2.0'), dict(threads=3)),
+    'another node beside it': (own('spacing_px: 3.0') + section('driver', 'spacing_px: 2.0', 'x: [1]'),
+                               dict(spacing_px=3.0)),
+    'a namespace is another node': (own('threads: 3') + section('/lab/fluoro_shape', 'spacing_px: 2.0'),
+                                    dict(threads=3)),
+    'a namespace by nesting is another node': (own('threads: 3') + 'lab:\n  fluoro_shape:\n    ros__parameters:\n      '
+                                                                   'spacing_px: 2.0\n', dict(threads=3)),
+    'one name before it is another node': (own('threads: 3') + section('/*/fluoro_shape', 'spacing_px: 2.0'),
+                                           dict(threads=3)),
     'the root by nesting': ('/:\n  fluoro_shape:\n    ros__parameters:\n      spacing_px: 2.0\n', dict(spacing_px=2.0)),
     'all by nesting': ('/**:\n  fluoro_shape:\n    ros__parameters:\n      spacing_px: 2.0\n', dict(spacing_px=2.0)),
     'two documents': (own('spacing_px: 3.0') + '---\n' + own('spacing_px: 4.0'), dict(spacing_px=4.0)),
     'one name twice': (own('spacing_px: 3.0', 'spacing_px: 4.0'), dict(spacing_px=4.0)),
-    'of every node': (own('use_sim_time: true', 'qos_overrides: {/tip: {publisher: {depth: 3}}}', 'threads: 3'), dict(threads=3)),
+    'of every node': (own('use_sim_time: true', 'qos_overrides: {/tip: {publisher: {depth: 3}}}', 'threads: 3'),
+                      dict(threads=3)),
     'names that are unknown': (own('robot_radus: 0.001', 'threads: 3', 'frame.rate: 15'), dict(threads=3)),
     'nothing below': ('fluoro_shape:\n  ros__parameters: {}\n', {}),
     'whole for real': (own('spacing_px: 3'), dict(spacing_px=3.0)),
@@ -87,7 +96,8 @@ CASES = {   # name -> text of the file, and the parameters that are not at their
     'no section': ('spacing_px: 3.0\n', REFUSED),
     'a list of sections': ('- spacing_px\n', REFUSED),
     'a null section': ('fluoro_shape:\n  ros__parameters:\n', REFUSED),
-    'a node beside its parameters': (section('/**', 'threads: 3') + '  fluoro_shape:\n    ros__parameters:\n      threads: 4\n', REFUSED),
+    'a node beside its parameters': (section('/**', 'threads: 3')
+                                     + '  fluoro_shape:\n    ros__parameters:\n      threads: 4\n', REFUSED),
     'something after it': (own('threads: 3') + 'foo: 1\n', REFUSED),
     'no name of a node': (own('threads: 3') + section('fluoro-shape', 'threads: 4'), REFUSED),
     'tabs': ('fluoro_shape:\n\tros__parameters:\n', REFUSED),
@@ -137,13 +147,16 @@ def test_node(tmp_path, case):
 def test_on_the_command_line(tmp_path):
     """The same words, and they win; whole and real numbers may be mixed there."""
     (tmp_path / 'my.yaml').write_text(own('threads: 3', 'spacing_px: 3.0'))
-    values = read_parameters(str(tmp_path / 'my.yaml'), ['threads:=010', 'tracking=off', 'base_position=[0, 1e-1, .2]', 'expected_length=[]', 'reference_frame=null'])
-    assert values == dict(threads=8, spacing_px=3.0, tracking=False, base_position=(0, 0.1, 0.2), expected_length=(), reference_frame='null')
+    values = read_parameters(str(tmp_path / 'my.yaml'), ['threads:=010', 'tracking=off', 'base_position=[0, 1e-1, .2]',
+                                                         'expected_length=[]', 'reference_frame=null'])
+    assert values == dict(threads=8, spacing_px=3.0, tracking=False, base_position=(0, 0.1, 0.2), expected_length=(),
+                          reference_frame='null')
 
 
 def test_a_file_of_other_nodes_says_of_which(tmp_path):
     (tmp_path / 'my.yaml').write_text(section('/lab/fluoro_shape', 'threads: 3') + section('driver', 'x: 1'))
-    with pytest.raises(ConfigError, match=r'my.yaml: no ros__parameters of fluoro_shape \(nor of /\*\*\), but of /lab/fluoro_shape, driver$'):
+    with pytest.raises(ConfigError, match=r'my.yaml: no ros__parameters of fluoro_shape \(nor of /\*\*\), '
+                                          r'but of /lab/fluoro_shape, driver$'):
         read_parameters(str(tmp_path / 'my.yaml'))
 
 
@@ -154,7 +167,8 @@ def test_names_that_are_unknown_are_told_with_the_nearest_that_is_known(tmp_path
     assert said == [f'{tmp_path / "my.yaml"}: there is no parameter robot_radus, but robot_radius']
 
 
-@pytest.mark.parametrize('name', ['defaults.yaml', 'preset_needle.yaml', 'preset_catheter.yaml', 'preset_concentric_tube.yaml'])
+@pytest.mark.parametrize('name', ['defaults.yaml', 'preset_needle.yaml', 'preset_catheter.yaml',
+                                  'preset_concentric_tube.yaml'])
 def test_files_that_are_installed(name):
     said = []
     Config.from_values(**read_parameters(str(resource_path(name)), (), said.append))

@@ -26,9 +26,11 @@ def message(new, *transforms):
     made = []
     for parent, child, stamp, R, t in transforms:
         q = Rotation.from_matrix(R).as_quat().tolist()
-        made.append(new('geometry_msgs/msg/TransformStamped', header=header(new, stamp, parent), child_frame_id=child, transform=new(
-            'geometry_msgs/msg/Transform', translation=new('geometry_msgs/msg/Vector3', x=float(t[0]), y=float(t[1]), z=float(t[2])),
-            rotation=new('geometry_msgs/msg/Quaternion', x=q[0], y=q[1], z=q[2], w=q[3]))))
+        made.append(new('geometry_msgs/msg/TransformStamped', header=header(new, stamp, parent), child_frame_id=child,
+                        transform=new(
+                            'geometry_msgs/msg/Transform', translation=new('geometry_msgs/msg/Vector3', x=float(t[0]),
+                                                                           y=float(t[1]), z=float(t[2])),
+                            rotation=new('geometry_msgs/msg/Quaternion', x=q[0], y=q[1], z=q[2], w=q[3]))))
     return new(TF_TYPE, transforms=made)
 
 
@@ -59,7 +61,8 @@ def close(found, R, t):
 
 
 def test_a_static_pose_holds_at_all_times(poses):
-    """The camera is 2 m along x of the reference and turned by 90 degrees about z: the reference's origin is 2 m along its y."""
+    """The camera is 2 m along x of the reference and turned by 90 degrees about z: the reference's origin is 2 m along
+    its y."""
     known = poses([('cell', 'eye', 0, turn(90), [2, 0, 0])])
     for stamp in (1, SECOND, 10**18):
         assert close(known('cell', 'eye', stamp), turn(-90), [0, 2, 0])
@@ -67,8 +70,11 @@ def test_a_static_pose_holds_at_all_times(poses):
 
 
 def test_between_two_poses_it_is_interpolated(poses):
-    known = poses(moving=[('cell', 'eye', SECOND, turn(10), [0, 0, 1]), ('cell', 'eye', 3 * SECOND, turn(50), [0, 0, 3]), ('cell', 'eye', 2 * SECOND, turn(40), [0, 0, 2])])
-    assert close(known('cell', 'eye', SECOND), turn(-10), [0, 0, -1]) and close(known('cell', 'eye', 3 * SECOND), turn(-50), [0, 0, -3])
+    known = poses(moving=[('cell', 'eye', SECOND, turn(10), [0, 0, 1]),
+                          ('cell', 'eye', 3 * SECOND, turn(50), [0, 0, 3]),
+                          ('cell', 'eye', 2 * SECOND, turn(40), [0, 0, 2])])
+    assert (close(known('cell', 'eye', SECOND), turn(-10), [0, 0, -1])
+            and close(known('cell', 'eye', 3 * SECOND), turn(-50), [0, 0, -3]))
     assert close(known('cell', 'eye', 1_250_000_000), turn(-17.5), [0, 0, -1.25])
     for stamp in (SECOND - 1, 3 * SECOND + 1):
         with pytest.raises(NoTransform, match='eye in cell was recorded from 1.000 to 3.000 s, not at'):
@@ -76,9 +82,11 @@ def test_between_two_poses_it_is_interpolated(poses):
 
 
 def test_along_a_tree(poses):
-    """table <- cell -> arm -> source: what lies above both frames does not count, even where it was not recorded at that time."""
+    """table <- cell -> arm -> source: what lies above both frames does not count, even where it was not recorded at
+    that time."""
     known = poses([('cell', 'table', 0, np.eye(3), [1, 0, 0]), ('/arm', '/source', 0, turn(90), [0, 0, 1])],
-                  [('cell', 'arm', SECOND, turn(0), [0, 0, 0]), ('cell', 'arm', 2 * SECOND, turn(90), [0, 0, 0]), ('world', 'cell', 9 * SECOND, turn(7), [5, 5, 5])])
+                  [('cell', 'arm', SECOND, turn(0), [0, 0, 0]), ('cell', 'arm', 2 * SECOND, turn(90), [0, 0, 0]),
+                   ('world', 'cell', 9 * SECOND, turn(7), [5, 5, 5])])
     # at 1.5 s the arm has turned by 45 degrees, the source by 135; the table's origin is (1, 0, 0) in the cell
     assert close(known('table', 'source', 1_500_000_000), turn(-135), turn(-135) @ [1, 0, -1])
     with pytest.raises(NoTransform, match='nothing between source and elsewhere'):
@@ -100,7 +108,8 @@ STAMPS = [5 * SECOND + k * SECOND // 10 for k in range(3)]
 
 
 def record_tf(path, planes='ab', frames='plane_{}_optical', topic=''):
-    """Three pairs whose CameraInfo has the intrinsics only; plane A's pose is static, plane B's comes twice a second."""
+    """Three pairs whose CameraInfo has the intrinsics only; plane A's pose is static, plane B's comes twice a
+    second."""
     with create_bag(path) as bag:
         for p in 'ab':
             bag.declare(f'/plane_{p}/image_raw', IMAGE)
@@ -115,8 +124,10 @@ def record_tf(path, planes='ab', frames='plane_{}_optical', topic=''):
                 bag.write(f'{topic}/tf_static' if p == 'a' else f'{topic}/tf', message(bag.new, transform), stamp)
         for stamp in STAMPS:
             for p, pixels, c in zip('ab', GOOD, CALIBRATIONS):
-                intrinsics = Calibration(c.camera_name, c.width, c.height, c.K, np.c_[c.K, np.zeros(3)], 'plumb_bob', np.zeros(5))
-                bag.write(f'/plane_{p}/camera_info', calibration_to_camera_info(intrinsics, stamp, frames.format(p), bag.new), stamp)
+                intrinsics = Calibration(c.camera_name, c.width, c.height, c.K, np.c_[c.K, np.zeros(3)], 'plumb_bob',
+                                         np.zeros(5))
+                bag.write(f'/plane_{p}/camera_info',
+                          calibration_to_camera_info(intrinsics, stamp, frames.format(p), bag.new), stamp)
                 bag.write(f'/plane_{p}/image_raw', array_to_image(pixels, stamp, frames.format(p), bag.new), stamp)
     return path
 

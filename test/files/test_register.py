@@ -29,7 +29,8 @@ def test_a_pose_worked_out_by_hand(tmp_path, capsys):
     assert said.startswith('5 points, missed by 0.000 mm rms') and '0.000 mm rms where they are left out' in said
     words = command.split()
     given = dict(zip(words[4::2], words[5::2]))
-    assert words[:4] == ['ros2', 'run', 'tf2_ros', 'static_transform_publisher'] and (given['--frame-id'], given['--child-frame-id']) == ('isocenter', 'robot_base')
+    assert (words[:4] == ['ros2', 'run', 'tf2_ros', 'static_transform_publisher']
+            and (given['--frame-id'], given['--child-frame-id']) == ('isocenter', 'robot_base'))
     assert np.allclose([float(given[f'--{name}']) for name in 'xyz'], T)
     assert np.allclose(Rotation.from_quat([float(given[f'--q{name}']) for name in 'xyzw']).as_matrix(), R)
 
@@ -41,13 +42,15 @@ def test_reads_points_in_either_unit(tmp_path, unit, scale):
 
 
 def test_noise_is_averaged_and_told():
-    """0.5 mm each way of 40 points: what is missed is that, and points left out of the fit are missed by a little more."""
+    """0.5 mm each way of 40 points: what is missed is that, and points left out of the fit are missed by a little
+    more."""
     rng = np.random.default_rng(0)
     robot = rng.uniform(-0.05, 0.05, (40, 3))
     turn = Rotation.from_euler('xyz', [20, -30, 70], degrees=True).as_matrix()
     seen = robot @ turn.T + [0.1, 0.2, 0.3] + rng.normal(0, 5e-4, (40, 3))
     found = fit_pose(robot, seen)
-    assert Rotation.from_matrix(found[0] @ turn.T).magnitude() < 0.005 and np.linalg.norm(found[1] - [0.1, 0.2, 0.3]) < 3e-4
+    assert (Rotation.from_matrix(found[0] @ turn.T).magnitude() < 0.005
+            and np.linalg.norm(found[1] - [0.1, 0.2, 0.3]) < 3e-4)
     fitted, left_out = (np.sqrt(np.mean(e**2)) for e in (errors(robot, seen, found), errors(robot, seen)))
     assert 7e-4 < fitted < left_out < 1.1e-3        # sqrt(3) * 0.5 mm
 
@@ -67,7 +70,8 @@ def test_points_that_do_not_tell_are_refused(robot, seen, says):
 
 def test_the_command_says_in_one_line_what_can_not_work(tmp_path, capsys):
     (tmp_path / 'empty.csv').write_text('x_mm,y_mm,z_mm\n')
-    for path, says in ((tmp_path / 'empty.csv', 'needs a first line with robot_x_mm'), (write(tmp_path / 'few.csv', ROBOT[:3], SEEN[:3]), 'few.csv: 3 points'),
+    for path, says in ((tmp_path / 'empty.csv', 'needs a first line with robot_x_mm'),
+                       (write(tmp_path / 'few.csv', ROBOT[:3], SEEN[:3]), 'few.csv: 3 points'),
                        (tmp_path / 'none.csv', 'none.csv')):
         assert calibrate.main(['--register', str(path), '--tf', 'a', 'b']) == 1
         error = capsys.readouterr().err

@@ -36,7 +36,8 @@ def test_results_follow_the_contract(run, tmp_path, capsys):
     assert main(run, '--out', tmp_path / 'out', '-p', BASE, '-p', 'reference_frame=cell') == 0
     results, stamps = read(tmp_path / 'out'), [5 * SECOND, 5_200_000_000]
     for topic in ('/backbone', '/tip', '/tip_pose', '/backbone_points'):
-        assert [(log, stamp_ns(m), m.header.frame_id) for log, m in results[topic]] == [(s, s, 'cell') for s in stamps], topic
+        assert ([(log, stamp_ns(m), m.header.frame_id) for log, m in results[topic]]
+                == [(s, s, 'cell') for s in stamps]), topic
     points = path_to_points(results['/backbone'][0][1])
     assert cKDTree(curve()).query(points)[0].max() < TOLERANCE
     tip = results['/tip'][0][1].point
@@ -73,7 +74,8 @@ def test_storages_agree(tmp_path):
 def test_images_are_copied_on_demand(run, tmp_path):
     main(run, '--out', tmp_path / 'out', '--with-images')
     results = read(tmp_path / 'out')
-    assert [(log, stamp_ns(m)) for log, m in results['/plane_b/image_raw']] == [(5 * SECOND + k * SECOND // 10 + SKEW,) * 2 for k in range(3)]
+    assert ([(log, stamp_ns(m)) for log, m in results['/plane_b/image_raw']]
+            == [(5 * SECOND + k * SECOND // 10 + SKEW,) * 2 for k in range(3)])
     assert bytes(results['/plane_a/image_raw'][0][1].data) == GOOD[0].tobytes()
     assert len(results['/plane_a/camera_info']) == 3
     # such a bag can be replayed itself
@@ -103,20 +105,23 @@ def test_silhouettes(tmp_path, full, compressed):
 def cluttered(pair):
     """The pair in front of another, longer wire, which takes half of the beam."""
     lines = [np.array([[20, 40], [300, 290]]), np.array([[20, 290], [300, 50]])]
-    passed = [cv2.GaussianBlur(cv2.polylines(np.ones(pixels.shape, np.float32), [line], False, 0.5, 2), (5, 5), 0) for pixels, line in zip(pair, lines)]
+    passed = [cv2.GaussianBlur(cv2.polylines(np.ones(pixels.shape, np.float32), [line], False, 0.5, 2), (5, 5), 0)
+              for pixels, line in zip(pair, lines)]
     return [np.round(pixels * share).astype(np.uint8) for pixels, share in zip(pair, passed)]
 
 
 def test_the_first_seconds_as_mask(tmp_path, monkeypatch, capsys):
     """Their pairs get no answer, and their mean goes along with every pair after them."""
     masks, intact = [], offline.reconstruct
-    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: masks.append(prior.masks) or intact(frame, config, prior))
+    monkeypatch.setattr(offline, 'reconstruct',
+                        lambda frame, config, prior: masks.append(prior.masks) or intact(frame, config, prior))
     record(tmp_path / 'run', [cluttered(BLANK), cluttered(BLANK), cluttered(GOOD), cluttered(GOOD)])
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', BASE, '--mask', 0.15) == 0
     assert outcomes(tmp_path / 'out') == {5_200_000_000: 'ok', 5_300_000_000: 'ok'}
     for _, path in read(tmp_path / 'out')['/backbone']:
         assert cKDTree(curve()).query(path_to_points(path))[0].max() < TOLERANCE
-    assert len(masks) == 2 and all(np.array_equal(seen, drawn) for pair in masks for seen, drawn in zip(pair, cluttered(BLANK)))
+    assert len(masks) == 2 and all(np.array_equal(seen, drawn) for pair in masks
+                                   for seen, drawn in zip(pair, cluttered(BLANK)))
     said = capsys.readouterr().out
     assert '2  made the mask' in said and '2  ok' in said
 
@@ -140,7 +145,8 @@ def test_a_mask_and_a_later_part_of_the_bag(tmp_path):
 @pytest.mark.parametrize('tracking, previous', [('true', [False, True, True]), ('false', [False] * 3)])
 def test_tracking_can_be_switched_off(tmp_path, monkeypatch, tracking, previous):
     seen, intact = [], offline.reconstruct
-    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None) or intact(frame, config, prior))
+    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: seen.append(prior.previous is not None)
+                                                                             or intact(frame, config, prior))
     record(tmp_path / 'run', [GOOD] * 3)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out', '-p', f'tracking={tracking}') == 0
     assert seen == previous
@@ -159,8 +165,10 @@ def test_topics_are_remapped_as_for_the_node(run, tmp_path):
             out.declare(f'/xray{topic}', kind)
         for r in bag.messages(bag.types()):
             out.write_raw(f'/xray{r.topic}', r.raw, r.log_ns)
-    rules = [word for p in 'ab' for topic in ('image_raw', 'camera_info') for word in ('-r', f'plane_{p}/{topic}:=/xray/plane_{p}/{topic}')]
-    assert main(tmp_path / 'cell', '--out', tmp_path / 'out', '--ros-args', *rules, '-r', 'backbone:=robot/shape', '-p', 'tracking:=false') == 0
+    rules = [word for p in 'ab' for topic in ('image_raw', 'camera_info')
+             for word in ('-r', f'plane_{p}/{topic}:=/xray/plane_{p}/{topic}')]
+    assert main(tmp_path / 'cell', '--out', tmp_path / 'out', '--ros-args', *rules, '-r', 'backbone:=robot/shape', '-p',
+                'tracking:=false') == 0
     topics = set(read(tmp_path / 'out'))
     assert topics == {'/robot/shape', '/tip', '/tip_pose', '/backbone_points', '/diagnostics'}
 
@@ -194,38 +202,51 @@ def test_tables_for_other_programs(run, tmp_path):
     """CSV and NPZ say the same as the bag, and the same bytes every time."""
     for folder in ('first', 'second'):
         (tmp_path / folder).mkdir()
-        assert main(run, '--out', tmp_path / folder / 'out', '--csv', tmp_path / folder / 'out.csv', '--npz', tmp_path / folder / 'out.npz', '-p', BASE) == 0
-    assert all((tmp_path / 'first' / name).read_bytes() == (tmp_path / 'second' / name).read_bytes() for name in ('out.csv', 'out.npz'))
+        assert main(run, '--out', tmp_path / folder / 'out', '--csv', tmp_path / folder / 'out.csv', '--npz',
+                    tmp_path / folder / 'out.npz', '-p', BASE) == 0
+    assert all((tmp_path / 'first' / name).read_bytes() == (tmp_path / 'second' / name).read_bytes()
+               for name in ('out.csv', 'out.npz'))
     paths = [path_to_points(path) for _, path in read(tmp_path / 'first' / 'out')['/backbone']]
     with (tmp_path / 'first' / 'out.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ['stamp_s', 'outcome', 's_m', 'x_m', 'y_m', 'z_m', 'sigma_m', 'residual_a_px', 'residual_b_px', 'reason', 'confidence']
+    assert list(rows[0]) == ['stamp_s', 'outcome', 's_m', 'x_m', 'y_m', 'z_m', 'sigma_m', 'residual_a_px',
+                             'residual_b_px', 'reason', 'confidence']
     points = np.array([[row[f'{axis}_m'] or 'nan' for axis in 'xyz'] for row in rows], float)
     n = len(paths[0])
     assert np.allclose(points[:n], paths[0], atol=1e-9) and np.allclose(points[n + 1:], paths[1], atol=1e-9)
-    assert {row['stamp_s'] for row in rows[:n]} == {'5.000000000'} and float(rows[n - 1]['s_m']) == pytest.approx(0.1, abs=0.01)
-    assert (rows[n]['outcome'], rows[n]['stamp_s'], rows[n]['x_m']) == ('no_device_in_plane_a', '5.100000000', '') and rows[n]['reason']
+    assert ({row['stamp_s'] for row in rows[:n]} == {'5.000000000'}
+            and float(rows[n - 1]['s_m']) == pytest.approx(0.1, abs=0.01))
+    assert ((rows[n]['outcome'], rows[n]['stamp_s'], rows[n]['x_m']) == ('no_device_in_plane_a', '5.100000000', '')
+            and rows[n]['reason'])
     arrays = np.load(tmp_path / 'first' / 'out.npz')
-    assert arrays['stamp_ns'].tolist() == [5 * SECOND, 5_100_000_000, 5_200_000_000] and arrays['outcome'][1] == 'no_device_in_plane_a'
+    assert (arrays['stamp_ns'].tolist() == [5 * SECOND, 5_100_000_000, 5_200_000_000]
+            and arrays['outcome'][1] == 'no_device_in_plane_a')
     assert np.array_equal(arrays['points_m'][arrays['pair'] == 2], paths[1]) and not (arrays['pair'] == 1).any()
-    assert arrays['residual_px'].shape == (2 * n, 2) and arrays['sigma_m'].shape == arrays['s_m'].shape == (2 * n,) and str(arrays['frame_id']) == 'plane_a_optical'
+    assert (arrays['residual_px'].shape == (2 * n, 2) and arrays['sigma_m'].shape == arrays['s_m'].shape == (2 * n,)
+            and str(arrays['frame_id']) == 'plane_a_optical')
 
 
 def test_the_confidence_goes_everywhere(run, tmp_path, monkeypatch):
     """Bag, CSV and NPZ have it of every pair; where it is not known, it is empty or NaN."""
     given = {5 * SECOND: 0.998, 5_100_000_000: 0.25, 5_200_000_000: np.nan}
     intact = offline.reconstruct
-    monkeypatch.setattr(offline, 'reconstruct', lambda frame, config, prior: dataclasses.replace(intact(frame, config, prior), confidence=given[frame.stamp_ns]))
-    assert main(run, '--out', tmp_path / 'out', '--csv', tmp_path / 'out.csv', '--npz', tmp_path / 'out.npz', '-p', BASE, '-p', 'min_confidence=0') == 0
+    monkeypatch.setattr(offline, 'reconstruct',
+                        lambda frame, config, prior: dataclasses.replace(intact(frame, config, prior),
+                                                                         confidence=given[frame.stamp_ns]))
+    assert main(run, '--out', tmp_path / 'out', '--csv', tmp_path / 'out.csv', '--npz', tmp_path / 'out.npz', '-p',
+                BASE, '-p', 'min_confidence=0') == 0
     results = read(tmp_path / 'out')
-    assert [{v.key: v.value for v in m.status[0].values}['confidence'] for _, m in results['/diagnostics']] == ['0.998', '0.250', '']
-    first, last = (np.frombuffer(bytes(m.data), '<f4').reshape(m.width, -1)[:, -1] for _, m in results['/backbone_points'])
+    assert ([{v.key: v.value for v in m.status[0].values}['confidence'] for _, m in results['/diagnostics']]
+            == ['0.998', '0.250', ''])
+    first, last = (np.frombuffer(bytes(m.data), '<f4').reshape(m.width, -1)[:, -1]
+                   for _, m in results['/backbone_points'])
     assert [m.fields[-1].name for _, m in results['/backbone_points']] == ['confidence'] * 2
     assert set(first) == {np.float32(0.998)} and np.isnan(last).all()
     with (tmp_path / 'out.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
     assert {(row['stamp_s'], row['outcome'], row['confidence']) for row in rows} == {
-        ('5.000000000', 'ok', '0.998000000'), ('5.100000000', 'no_device_in_plane_a', '0.250000000'), ('5.200000000', 'ok', '')}
+        ('5.000000000', 'ok', '0.998000000'), ('5.100000000', 'no_device_in_plane_a', '0.250000000'),
+        ('5.200000000', 'ok', '')}
     assert [bool(row['reason']) for row in rows] == [row['outcome'] != 'ok' for row in rows]
     assert np.array_equal(np.load(tmp_path / 'out.npz')['confidence'], list(given.values()), equal_nan=True)
 
@@ -244,7 +265,8 @@ def test_images_read_ahead_come_in_order_and_errors_in_their_turn():
 
 def test_other_topics(tmp_path, run):
     """Planes may be swapped by name: the answer is the same, stamped by the other plane."""
-    names = [f'--{what}-{p}={f"plane_{q}/{topic}"}' for what, topic in (('image', 'image_raw'), ('info', 'camera_info')) for p, q in ('ab', 'ba')]
+    names = [f'--{what}-{p}={f"plane_{q}/{topic}"}' for what, topic in (('image', 'image_raw'), ('info', 'camera_info'))
+             for p, q in ('ab', 'ba')]
     assert main(run, '--out', tmp_path / 'out', '-p', BASE, *names) == 0
     assert [log for log, _ in read(tmp_path / 'out')['/tip']] == [5 * SECOND + SKEW, 5_200_000_000 + SKEW]
 
@@ -267,7 +289,8 @@ def test_frames_that_contradict_are_said(tmp_path, capsys):
     record(tmp_path / 'run', [GOOD], spoil=spoil)
     assert main(tmp_path / 'run', '--out', tmp_path / 'out') == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == 'plane A: its images are of frame "plane_b_optical", its camera info of "plane_a_optical": are the calibrations exchanged?'
+    assert (lines[-1] == 'plane A: its images are of frame "plane_b_optical", its camera info of "plane_a_optical": '
+                         'are the calibrations exchanged?')
     assert not any('plane B' in line for line in lines[1:])
 
 
@@ -277,7 +300,8 @@ def test_no_camera_info(tmp_path):
     assert list(outcomes(tmp_path / 'out').values()) == ['no_camera_info']
 
 
-@pytest.mark.parametrize('field, value, says', [('p', np.zeros(12), 'P is zero'), ('d', np.zeros(1000), 'D has 1000 coefficients')], ids=['p', 'd'])
+@pytest.mark.parametrize('field, value, says', [('p', np.zeros(12), 'P is zero'),
+                                                ('d', np.zeros(1000), 'D has 1000 coefficients')], ids=['p', 'd'])
 def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, capsys, field, value, says):
     with create_bag(tmp_path / 'run') as bag:
         for p, pixels, c in zip('ab', GOOD, CALIBRATIONS):
@@ -295,7 +319,8 @@ def test_a_refused_camera_info_is_reported_and_the_one_before_holds(tmp_path, ca
 
 def test_a_camera_holds_from_its_stamp_on():
     known = [(10, 'first'), (20, 'second'), (30, 'third')]
-    assert [offline.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)] == ['first', 'first', 'first', 'second', 'second', 'third', 'third']
+    assert ([offline.camera_at(known, stamp) for stamp in (5, 10, 19, 20, 29, 30, 99)]
+            == ['first', 'first', 'first', 'second', 'second', 'third', 'third'])
     assert offline.camera_at([], 5) is None
 
 
@@ -323,13 +348,16 @@ def test_an_error_of_the_program_costs_its_pair_and_the_exit_code(run, tmp_path,
 def test_parameters_from_file_and_command_line(tmp_path):
     path = tmp_path / 'params.yaml'
     path.write_text('/**:\n  ros__parameters:\n    use_sim_time: true\n    robot_radius: 1e-3\n    polarity: bright\n'
-                    'fluoro_shape:\n  ros__parameters:\n    polarity: auto\n    expected_length: [0.01, 1.0]\n    tracking: false\nother:\n  ros__parameters: {x: 1}\n')
+                    'fluoro_shape:\n  ros__parameters:\n    polarity: auto\n    expected_length: '
+                    '[0.01, 1.0]\n    tracking: false\nother:\n  ros__parameters: {x: 1}\n')
     values = read_parameters(str(path), ['tracking=true', 'spacing_px:=1e1', 'base_position=[1, 2e-1, 3]'])
-    assert values == dict(robot_radius=1e-3, polarity='auto', expected_length=(0.01, 1), tracking=True, spacing_px=10.0, base_position=(1, 0.2, 3))
+    assert values == dict(robot_radius=1e-3, polarity='auto', expected_length=(0.01, 1), tracking=True, spacing_px=10.0,
+                          base_position=(1, 0.2, 3))
     assert Config.from_values(**values).detection.robot_radius == 0.001
 
 
-@pytest.mark.parametrize('text, says', [('', 'not a ROS parameter file'), ('fluoro_shape: 3', 'no ros__parameters'), ('a: [', 'not YAML'),
+@pytest.mark.parametrize('text, says', [('', 'not a ROS parameter file'), ('fluoro_shape: 3', 'no ros__parameters'),
+                                        ('a: [', 'not YAML'),
                                         ('other:\n  ros__parameters: {}', 'no ros__parameters of fluoro_shape')])
 def test_a_bad_parameter_file_is_named(tmp_path, text, says):
     (tmp_path / 'params.yaml').write_text(text)
@@ -342,13 +370,15 @@ def test_a_device_gives_the_radius(run, tmp_path):
     path.write_text('segments: [{length: rest, radius: 0.001, material: metal}]')
     assert main(run, '--out', tmp_path / 'out') == 0
     assert main(run, '--out', tmp_path / 'described', '-p', f'device={path}', '-p', 'robot_radius=0.0003') == 0
-    tips, described = ([(m.point.x, m.point.y, m.point.z) for _, m in read(tmp_path / out)['/tip']] for out in ('out', 'described'))
+    tips, described = ([(m.point.x, m.point.y, m.point.z) for _, m in read(tmp_path / out)['/tip']]
+                       for out in ('out', 'described'))
     assert tips == described and len(tips) == 2
 
 
 def process(*arguments, code=None):
     start = ['-m', 'fluoro_shape_ros.files.replay'] if code is None else ['-c', code]
-    return subprocess.run([sys.executable, *start, '-p', RADIUS, *map(str, arguments)], capture_output=True, text=True, timeout=120)
+    return subprocess.run([sys.executable, *start, '-p', RADIUS, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=120)
 
 
 def test_as_a_process(run, tmp_path):
@@ -361,9 +391,12 @@ def test_as_a_process(run, tmp_path):
 @pytest.mark.parametrize('arguments, code, says', [
     (['none'], 1, 'none: no such bag'),
     (['damaged'], 1, 'damaged: can\'t be read as a bag'),
-    (['run', '--image-a', 'elsewhere'], 1, '/elsewhere is not in the bag; name another with --image-a (such topics in it: /plane_a/image_raw, /plane_b/image_raw)'),
-    (['run', '--info-b', 'plane_b/image_raw'], 1, '/plane_b/image_raw is a sensor_msgs/msg/Image; name another with --info-b'),
-    (['run', '-p', 'sync_slop=0.001'], 1, 'no images pair: there are 3 of plane A and 3 of plane B, 0 without a stamp; sync_slop is 1 ms'),
+    (['run', '--image-a', 'elsewhere'], 1, '/elsewhere is not in the bag; name another with --image-a '
+                                           '(such topics in it: /plane_a/image_raw, /plane_b/image_raw)'),
+    (['run', '--info-b', 'plane_b/image_raw'], 1,
+     '/plane_b/image_raw is a sensor_msgs/msg/Image; name another with --info-b'),
+    (['run', '-p', 'sync_slop=0.001'], 1, 'no images pair: there are 3 of plane A and 3 of plane B, 0 without a stamp; '
+                                          'sync_slop is 1 ms'),
     (['run', '--params', 'none.yaml'], 1, 'none.yaml'),
     (['run', '--out', '.'], 1, '. exists already'),
     (['run', '-p', 'robot_radius=-1'], 2, 'robot_radius: must lie in'),
@@ -376,7 +409,8 @@ def test_as_a_process(run, tmp_path):
     (['run', '--start', '-1'], 2, '--start'),
     (['run', '--mask', '1', '--duration', '0.5'], 2, '--mask: nothing is left'),
     (['run', '--mask', '9'], 1, '--mask 9: no pair comes after the 3 that made the mask'),
-    (['run', '-r', 'plane_c/image_raw:=/x'], 2, '-r plane_c/image_raw:=/x: there is no topic plane_c/image_raw; those are plane_a/image_raw, '),
+    (['run', '-r', 'plane_c/image_raw:=/x'], 2, '-r plane_c/image_raw:=/x: there is no topic plane_c/image_raw; '
+                                                'those are plane_a/image_raw, '),
     (['run', '-r', 'tip'], 2, '-r tip: needs the form FROM:=TO'),
     (['run', '-r', 'tip:=backbone'], 2, 'two results have the same topic'),
     (['run', '--csv', 'run'], 1, 'run exists already'),
@@ -405,7 +439,8 @@ def test_exit_codes_of_the_process(tmp_path, arguments, code):
     assert 'Traceback' not in done.stderr
 
 
-@pytest.mark.parametrize('missing, extra, more', [('rosbags', 'bags', ()), ('mcap', 'bags', ()), ('plotly', 'report', ('--report', 'page.html'))])
+@pytest.mark.parametrize('missing, extra, more', [('rosbags', 'bags', ()), ('mcap', 'bags', ()),
+                                                  ('plotly', 'report', ('--report', 'page.html'))])
 def test_what_is_not_installed_is_named_with_its_extra(run, tmp_path, capsys, monkeypatch, missing, extra, more):
     for module in [name for name in sys.modules if name.split('.')[0] == missing]:
         monkeypatch.delitem(sys.modules, module)

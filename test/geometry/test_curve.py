@@ -17,7 +17,8 @@ def test_arc_length_by_hand():
     assert_allclose(at_arc_length(np.array([[0.0, 0], [3, 4], [3, 5]]), np.array([2.5, 5.5])), [[1.5, 2], [3, 4.5]])
 
 
-@pytest.mark.parametrize('length, steps', [(0.0025, [0, 0.001, 0.002, 0.0025]), (0.003, [0, 0.001, 0.002, 0.003]), (0.0005, [0, 0.0005])])
+@pytest.mark.parametrize('length, steps', [(0.0025, [0, 0.001, 0.002, 0.0025]), (0.003, [0, 0.001, 0.002, 0.003]),
+                                           (0.0005, [0, 0.0005])])
 def test_only_the_last_step_is_shorter(length, steps):
     assert_allclose(even_steps(length, 0.001), steps, atol=1e-12)
 

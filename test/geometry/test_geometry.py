@@ -50,7 +50,8 @@ def test_jacobian_is_the_derivative_of_project():
 
 
 def test_what_displaced_planes_do_to_a_curve_by_hand():
-    # at the origin, 1 m from both sources, a px is 1 mm. A curve along y: plane A shifts it along x, plane B along z, both together along y
+    # at the origin, 1 m from both sources, a px is 1 mm. A curve along y: plane A shifts it along x, plane B along z,
+    # both together along y
     found = calibration_covariance((A, B), np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), 0.5)[0]
     assert_allclose(found, np.diag([0.25e-6, 0.125e-6, 0.25e-6]), rtol=0.06, atol=1e-12)
 
@@ -69,10 +70,12 @@ def test_displaced_planes_shift_a_slanting_curve_by_as_much_as_it_takes_to_see_i
             ends.append((t @ J, t @ d))         # in units of the tangent
         moved.append(np.linalg.solve([*rows, ends[0][0] + ends[1][0]], [*seen, ends[0][1] + ends[1][1]]))
     found = calibration_covariance((A, B), np.zeros((1, 3)), tangent[None], sigma_px)[0]
-    assert_allclose(np.sqrt(np.linalg.eigvalsh(found)), np.sqrt(np.linalg.eigvalsh(np.cov(np.array(moved).T))), rtol=0.06)
+    assert_allclose(np.sqrt(np.linalg.eigvalsh(found)), np.sqrt(np.linalg.eigvalsh(np.cov(np.array(moved).T))),
+                    rtol=0.06)
 
 
-@pytest.mark.parametrize('distortion', [None, Distortion('plumb_bob', K, np.array([0.3, -0.1, 0.001, 0.002, 0.0]), np.eye(3))])
+@pytest.mark.parametrize('distortion',
+                         [None, Distortion('plumb_bob', K, np.array([0.3, -0.1, 0.001, 0.002, 0.0]), np.eye(3))])
 def test_a_cropped_view_counts_its_pixels_from_its_own_corner(distortion):
     whole = make_view('b', Pb, 101, 81, distortion)
     part = crop(whole, slice(20, 71), slice(10, 91))
@@ -143,7 +146,8 @@ def test_triangulation_answers_nan_for_unusable_pixels():
 
 @pytest.mark.parametrize('P, reason', [
     (np.zeros((3, 4)), 'zero or singular'), (np.full((3, 4), np.nan), 'finite'), (np.eye(3), '3x4'),
-    (np.r_[Pa[:2], [[0, 0, 0, 1.0]]], 'zero or singular'), (np.eye(3, 4) * 1e-3 + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1, 0]], 'focal length')])
+    (np.r_[Pa[:2], [[0, 0, 0, 1.0]]], 'zero or singular'),
+    (np.eye(3, 4) * 1e-3 + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1, 0]], 'focal length')])
 def test_what_cannot_be_a_camera_is_named(P, reason):
     with pytest.raises(GeometryError, match=f'plane a.*{reason}'):
         make_view('a', P, 101, 81)
@@ -164,14 +168,16 @@ def test_planes_that_see_no_depth_are_named():
 @pytest.mark.parametrize('z', [0.0, 1.0, -2.5])
 def test_a_stereo_pair_looks_to_where_its_images_are_a_quarter_apart_whatever_the_frame(z):
     # 0.1 m apart: 1000 px * 0.1 m / distance = 101 px / 4
-    pair = tuple(make_view(name, K @ np.array([[1.0, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, z]]), 101, 81) for name, x in (('a', 0.0), ('b', -0.1)))
+    pair = tuple(make_view(name, K @ np.array([[1.0, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, z]]), 101, 81)
+                 for name, x in (('a', 0.0), ('b', -0.1)))
     check_pair(pair)
     check_scale(pair, 0.001)
     assert_allclose(isocenter(pair), [0.05, 0, 400 / 101 - z], atol=1e-9)
 
 
 def test_a_source_where_the_planes_look_is_named():
-    """The device would be a quarter as wide as the image, and filters without end be made for it: 1000 px a radian, 81 px high, radius 10.125 mm at 1 m."""
+    """The device would be a quarter as wide as the image, and filters without end be made for it: 1000 px a radian, 81
+    px high, radius 10.125 mm at 1 m."""
     check_scale((A, B), 0.0101)
     with pytest.raises(GeometryError, match='plane a: a device of radius 10.2 mm would be 20.4 px wide'):
         check_scale((A, B), 0.0102)
@@ -186,7 +192,8 @@ def test_a_device_less_than_a_tenth_of_a_pixel_wide_asks_for_metres():
         check_scale((A, B), 0.000049)
 
 
-@pytest.mark.parametrize('model, D', [('plumb_bob', [-0.2, 0.05, 1e-3, -2e-3, 0.01]), ('rational_polynomial', [0.3, 0.1, 0, 0, 0.02, 0.1, 0.05, 0.01]),
+@pytest.mark.parametrize('model, D', [('plumb_bob', [-0.2, 0.05, 1e-3, -2e-3, 0.01]),
+                                      ('rational_polynomial', [0.3, 0.1, 0, 0, 0.02, 0.1, 0.05, 0.01]),
                                       ('equidistant', [0.02, -0.01, 0.003, 0.0])])
 def test_distortion_is_removed_and_put_back(model, D):
     view = make_view('a', Pa, 101, 81, Distortion(model, K, np.array(D), np.eye(3)))

@@ -31,7 +31,8 @@ from fluoro_shape_ros.geometry.cameras import (
 SIZE = 1024
 UNIT = st.floats(-1, 1)
 ANGLE = st.floats(0, 2 * np.pi)
-POINTS = st.lists(st.tuples(UNIT, UNIT, UNIT), min_size=1, max_size=8).map(lambda p: 0.1 * np.array(p))     # within 0.1 m of the isocentre, per axis
+# within 0.1 m of the isocentre, per axis
+POINTS = st.lists(st.tuples(UNIT, UNIT, UNIT), min_size=1, max_size=8).map(lambda p: 0.1 * np.array(p))
 ANY_PX = st.one_of(st.floats(width=64), st.floats(-2000, 2000))
 
 
@@ -46,7 +47,8 @@ def view(name, angle, tilt=0.0, roll=0.0, distance=0.8, mirrored=False, f=2000.0
 def biplane(draw):
     """A pair of views 30 to 150 degrees apart, either of which may be mirrored."""
     first, apart = draw(ANGLE), draw(st.floats(np.pi / 6, 5 * np.pi / 6))
-    return tuple(view(name, angle, draw(st.floats(-0.3, 0.3)), draw(ANGLE), draw(st.floats(0.5, 1.2)), draw(st.booleans()))
+    return tuple(view(name, angle, draw(st.floats(-0.3, 0.3)), draw(ANGLE), draw(st.floats(0.5, 1.2)),
+                      draw(st.booleans()))
                  for name, angle in (('a', first), ('b', first + apart)))
 
 
@@ -68,7 +70,8 @@ def test_mirroring_an_image_moves_no_point(views, X):
     assume(plane_angle(views) > np.pi / 9)
     flip = np.array([[-1.0, 0, SIZE - 1], [0, 1, 0], [0, 0, 1]])
     mirrored = make_view('a', flip @ views[0].P, SIZE, SIZE)
-    assert np.allclose(source(mirrored.P), source(views[0].P)) and np.sign(decompose(mirrored.P)[0][0, 0]) == -np.sign(decompose(views[0].P)[0][0, 0])
+    assert (np.allclose(source(mirrored.P), source(views[0].P))
+            and np.sign(decompose(mirrored.P)[0][0, 0]) == -np.sign(decompose(views[0].P)[0][0, 0]))
     a, b = project(mirrored.P, X), project(views[1].P, X)
     assert np.allclose(a[:, 0], SIZE - 1 - project(views[0].P, X)[:, 0])
     assert np.allclose(triangulate(mirrored.P, views[1].P, a, b), X, atol=1e-7)
@@ -82,8 +85,10 @@ def test_planes_that_see_no_depth_are_refused(angle, tilt, step, mirrored):
 
 
 # rays on which a Newton step met a singular matrix, and the whole lot was lost
-MET_NOWHERE = (make_view('a', [[1602.28723, 1196.94429, 512.0, 256.0], [1196.94429, -1602.28723, 512.0, 256.0], [0, 0, 1, 0.5]], SIZE, SIZE),
-               make_view('b', [[396.676428, 1263.5092, -1583.77281, 512.0], [2046.54436, -158.316583, 220.762377, 512.0],
+MET_NOWHERE = (make_view('a', [[1602.28723, 1196.94429, 512.0, 256.0], [1196.94429, -1602.28723, 512.0, 256.0],
+                               [0, 0, 1, 0.5]], SIZE, SIZE),
+               make_view('b', [[396.676428, 1263.5092, -1583.77281, 512.0],
+                               [2046.54436, -158.316583, 220.762377, 512.0],
                                [0.270259376, 0.860840683, 0.431176517, 1.0]], SIZE, SIZE))
 
 
@@ -91,7 +96,8 @@ MET_NOWHERE = (make_view('a', [[1602.28723, 1196.94429, 512.0, 256.0], [1196.944
 @example(MET_NOWHERE, [(0.0, -890.0, -356.0, 1948.0)])
 @given(biplane(), st.lists(st.tuples(ANY_PX, ANY_PX, ANY_PX, ANY_PX), max_size=6))
 def test_any_pixels_triangulate_to_points_or_nothing(views, pixels):
-    """NaN, infinity, rays that never meet or meet behind the source: a finite point or NaN each, and none spoils another."""
+    """NaN, infinity, rays that never meet or meet behind the source: a finite point or NaN each, and none spoils
+    another."""
     px = np.array(pixels, float).reshape(-1, 4)
     Pa, Pb = (v.P for v in views)
     good = np.r_[project(Pa, np.zeros((1, 3)))[0], project(Pb, np.zeros((1, 3)))[0]]
@@ -121,7 +127,8 @@ def test_the_jacobian_is_the_derivative(views, X):
 
 
 @examples()
-@given(st.sampled_from([('plumb_bob', 5), ('rational_polynomial', 8), ('equidistant', 4)]), st.lists(st.floats(-0.02, 0.02), min_size=8, max_size=8), ANGLE,
+@given(st.sampled_from([('plumb_bob', 5), ('rational_polynomial', 8), ('equidistant', 4)]),
+       st.lists(st.floats(-0.02, 0.02), min_size=8, max_size=8), ANGLE,
        st.lists(st.tuples(st.floats(0, SIZE - 1), st.floats(0, SIZE - 1)), max_size=6))
 def test_removing_distortion_is_undone_by_putting_it_back(model, D, angle, pixels):
     name, count = model

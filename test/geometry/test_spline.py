@@ -71,7 +71,8 @@ def test_it_smooths_jitter():
     assert off.mean() < 0.6 * np.linalg.norm(np.cross(noisy, END / LENGTH), axis=1).mean()
 
 
-@pytest.mark.parametrize('ends, shift', [((True, False), 0.03), ((False, True), 0.01), ((True, True), 0.03), ((False, False), 0.01)])
+@pytest.mark.parametrize('ends, shift', [((True, False), 0.03), ((False, True), 0.01), ((True, True), 0.03),
+                                         ((False, False), 0.01)])
 def test_prolonged_it_goes_on_straight_and_keeps_its_place(ends, shift):
     spline = through(straight(), 0.01)
     longer, added = prolong(spline, ends, 0.02)

@@ -46,7 +46,8 @@ def blocked_where(dark, level=4, bright=180):
 
 def assert_found(field, dark):
     """Whether a field is what is not `dark`, but for pixels at its border."""
-    near = cv2.dilate(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3))), np.ones((17, 17))) > 0
+    near = cv2.dilate(cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3))),
+                      np.ones((17, 17))) > 0
     assert ((field == 0) == dark)[~near].all() and 0 < near.mean() < 0.5
 
 
@@ -106,7 +107,8 @@ def test_dense_anatomy_beside_a_blade_does_not_hide_that(name):
     assert_found(field_of_view(np.where(blade, 1, image).astype(np.uint8)), blade)
 
 
-@pytest.mark.parametrize('change', [lambda i: i.astype(np.uint16) * 200, lambda i: i.astype(np.float32) / 255, lambda i: i.astype(np.float32) - 4])
+@pytest.mark.parametrize('change', [lambda i: i.astype(np.uint16) * 200, lambda i: i.astype(np.float32) / 255,
+                                    lambda i: i.astype(np.float32) - 4])
 def test_depth_and_range_of_the_image_do_not_matter(change):
     image = np.where(OPENINGS['an intensifier'], 4, 180).astype(np.uint8)
     assert np.array_equal(field_of_view(change(image)), field_of_view(image))
@@ -123,7 +125,8 @@ def test_distance_to_the_border():
     assert_allclose(d, [60, 0, 4, 20], atol=6)
 
 
-DISPLAYS = {'linear': lambda x: x, 'logarithmic': lambda x: np.log1p(15 * x) / np.log(16), 'gamma': lambda x: x**0.5, 'windowed': lambda x: np.clip(2 * x - 0.3, 0, 1)}
+DISPLAYS = {'linear': lambda x: x, 'logarithmic': lambda x: np.log1p(15 * x) / np.log(16), 'gamma': lambda x: x**0.5,
+            'windowed': lambda x: np.clip(2 * x - 0.3, 0, 1)}
 
 
 @pytest.mark.parametrize('display', DISPLAYS)
@@ -139,7 +142,8 @@ def test_scatter_beyond_the_blades_hides_them_on_no_display(name, display):
 
 def test_letters_beyond_the_blades_are_not_the_patient():
     dark = OPENINGS['four blades']
-    image = cv2.resize(np.where(dark, 4, 180 - 0.1 * U).astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+    image = cv2.resize(np.where(dark, 4, 180 - 0.1 * U).astype(np.uint8), None, fx=4, fy=4,
+                       interpolation=cv2.INTER_NEAREST)
     cv2.putText(image, 'L  12 mA', (20, 50), cv2.FONT_HERSHEY_PLAIN, 2, 255, 2)
     assert_found(field_of_view(image), np.kron(dark, np.ones((4, 4), bool)))
 

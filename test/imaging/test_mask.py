@@ -43,7 +43,8 @@ def test_a_shifted_background_is_gone_down_to_the_noise(mask, shift):
     live = background(shift)
     left = subtract(noisy(live, 100), mask)[20:-20, 20:-20]
     assert live[20:-20, 20:-20].std() / live.mean() > 0.15
-    noise = (NOISE * np.sqrt(LEVEL / live[20:-20, 20:-20])).std()**2 + np.mean(NOISE**2 * LEVEL / live[20:-20, 20:-20]) * (1 + 1 / 8)
+    noise = ((NOISE * np.sqrt(LEVEL / live[20:-20, 20:-20])).std()**2
+             + np.mean(NOISE**2 * LEVEL / live[20:-20, 20:-20]) * (1 + 1 / 8))
     assert left.std() / left.mean() < 1.15 * np.sqrt(noise)
     assert_allclose(left.mean(), mask.mean(), rtol=0.02)
 
@@ -107,7 +108,8 @@ def test_the_pipeline_sees_a_faint_device_through_its_masks(seed, shift):
     run, masks = fluoroscopy(seed)
     scene, move = run.scene(), np.float32([[1, 0, shift[0]], [0, 1, shift[1]]])
     masks = tuple(cv2.warpAffine(m, move, SIZE[::-1], borderMode=cv2.BORDER_REPLICATE) for m in masks)
-    result = reconstruct(scene.frame, Config.from_values(base_position=scene.base_position.tolist()), Prior(masks=masks))
+    result = reconstruct(scene.frame, Config.from_values(base_position=scene.base_position.tolist()),
+                         Prior(masks=masks))
     assert result.outcome is Outcome.OK, result.detail
     assert cKDTree(scene.truth).query(result.shape.points)[0].mean() < 0.1e-3
     assert np.linalg.norm(result.shape.tip - scene.truth[-1]) < 0.4e-3
@@ -115,4 +117,5 @@ def test_the_pipeline_sees_a_faint_device_through_its_masks(seed, shift):
 
 def test_an_empty_field_behind_its_mask_shows_no_device():
     run, masks = fluoroscopy(1)
-    assert reconstruct(run.without_device(), Config(), Prior(masks=tuple(masks))).outcome in (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)
+    assert reconstruct(run.without_device(), Config(), Prior(masks=tuple(masks))).outcome in (Outcome.NO_DEVICE_A,
+                                                                                              Outcome.NO_DEVICE_B)

@@ -30,7 +30,8 @@ def textured(shape, seed=0):
 @pytest.mark.parametrize('s', [1.0, 1.5, 2.5])
 @pytest.mark.parametrize('k', range(0, DIRECTIONS, 2))
 def test_a_line_in_a_filters_direction_has_the_profile_of_the_second_derivative(k, s):
-    """-sigma^2 d^2/dy^2 of exp(-y^2 / 2 s^2) blurred by sigma is sigma^2 s / S^3 (1 - y^2 / S^2) exp(-y^2 / 2 S^2), S^2 = s^2 + sigma^2; averaging along it is 1."""
+    """-sigma^2 d^2/dy^2 of exp(-y^2 / 2 s^2) blurred by sigma is sigma^2 s / S^3 (1 - y^2 / S^2) exp(-y^2 / 2 S^2),
+    S^2 = s^2 + sigma^2; averaging along it is 1."""
     angle = 180 * k / DIRECTIONS
     found, y = along_lines(line(angle, s, 2.0), SIGMA, LENGTH)[80:101, 80:101], across(angle)[80:101, 80:101]
     S = np.hypot(s, SIGMA)
@@ -41,7 +42,8 @@ def test_a_line_in_a_filters_direction_has_the_profile_of_the_second_derivative(
 
 @pytest.mark.parametrize('angle', [3.0, 7.5, 37.5, 52.0, 100.0, 171.0])
 def test_between_directions_a_line_loses_what_its_turn_costs(angle):
-    """Its spectrum lies along its normal, at d to the filter's: sigma^2 cos^2 d s / (s^2 + sigma^2 cos^2 d + length^2 sin^2 d)^(3/2) in the middle."""
+    """Its spectrum lies along its normal, at d to the filter's: sigma^2 cos^2 d s / (s^2 + sigma^2 cos^2 d + length^2
+    sin^2 d)^(3/2) in the middle."""
     s, turn = 1.5, np.deg2rad(angle) - np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     expected = SIGMA**2 * np.cos(turn)**2 * s / (s**2 + (SIGMA * np.cos(turn))**2 + (LENGTH * np.sin(turn))**2)**1.5
     assert_allclose(along_lines(line(angle, s), SIGMA, LENGTH)[90, 90], expected.max(), rtol=1e-3)
@@ -75,10 +77,12 @@ def test_a_linear_ramp_answers_nothing_away_from_the_borders():
 
 @pytest.mark.parametrize('sigma, length', [(1.2, 7.0), (1.2, 28.0), (2.0, 7.0)])
 def test_noise_counts_by_the_norm_of_the_kernel_in_every_direction(sigma, length):
-    """Parseval: its square is (2 pi)^-2 times the integral of sigma^4 w_v^4 exp(-sigma^2 w_v^2 - length^2 w_u^2), 3 / (16 pi sigma length)."""
+    """Parseval: its square is (2 pi)^-2 times the integral of sigma^4 w_v^4 exp(-sigma^2 w_v^2 - length^2 w_u^2), 3 /
+    (16 pi sigma length)."""
     noise = np.fft.fft2(np.random.default_rng(0).normal(0, 1, (512, 512)))
     gain = np.sqrt(3 / (16 * np.pi * sigma * length))
-    filters = [part for pair in _spectra(noise.shape, round(100 * sigma), round(100 * length)) for part in (pair.real, pair.imag)]
+    filters = [part for pair in _spectra(noise.shape, round(100 * sigma), round(100 * length))
+               for part in (pair.real, pair.imag)]
     assert len(filters) == DIRECTIONS
     for spectrum in filters:
         assert_allclose(np.sqrt(np.mean(spectrum.astype(float)**2)), gain, rtol=0.01)
@@ -104,7 +108,8 @@ def test_a_turned_or_mirrored_image_has_the_turned_or_mirrored_answer():
     found, far = along_lines(image, SIGMA, LENGTH), int(6 * LENGTH)
     for change in (np.transpose, np.fliplr, np.flipud, lambda x: np.rot90(x, 2)):
         there = along_lines(np.ascontiguousarray(change(image)), SIGMA, LENGTH)
-        assert_allclose(change(there)[far:-far, far:-far], found[far:-far, far:-far], atol=1e-3)       # an even size has one frequency that is its own mirror
+        # an even size has one frequency that is its own mirror
+        assert_allclose(change(there)[far:-far, far:-far], found[far:-far, far:-far], atol=1e-3)
 
 
 @pytest.mark.parametrize('shape', [(40, 40), (61, 74), (75, 91), (1, 30), (30, 1)])

@@ -23,7 +23,8 @@ def segment(p, q):
 def draw(*distances, noise=0.2, seed=0):
     """Dark lines of Gaussian profile (sigma 1.5 px, 20 deep) where a distance is 0, on a level of 100."""
     d = np.min(distances, axis=0)
-    return (100 - 20 * np.exp(-0.5 * (d / SIGMA) ** 2) + np.random.default_rng(seed).normal(0, noise, d.shape)).astype(np.float32)
+    return (100 - 20 * np.exp(-0.5 * (d / SIGMA) ** 2)
+            + np.random.default_rng(seed).normal(0, noise, d.shape)).astype(np.float32)
 
 
 def chains(image, min_length_px=50.0, field=FIELD):

@@ -11,8 +11,33 @@ from scipy.special import ndtr
 
 from fluoro_shape_ros.data import Distortion
 from fluoro_shape_ros.geometry.cameras import decompose, distort, project, undistort
-from fluoro_shape_ros.imaging.profiles import WIDTHS, apparent_width, background, contrast_of, likeness, mean_profile, odd_width, own_shadow, pieces, shadow, straight_on
-from fluoro_shape_ros.imaging.strips import FOUND_PX, Measurement, Model, Sheet, Strips, clutter, cut, cut_along, half_width_range, lay_out, measure, search
+from fluoro_shape_ros.imaging.profiles import (
+    WIDTHS,
+    apparent_width,
+    background,
+    contrast_of,
+    likeness,
+    mean_profile,
+    odd_width,
+    own_shadow,
+    pieces,
+    shadow,
+    straight_on,
+)
+from fluoro_shape_ros.imaging.strips import (
+    FOUND_PX,
+    Measurement,
+    Model,
+    Sheet,
+    Strips,
+    clutter,
+    cut,
+    cut_along,
+    half_width_range,
+    lay_out,
+    measure,
+    search,
+)
 from fluoro_shape_ros.sim.carm import CArm, view
 
 HALF_WIDTH = 2.0        # px
@@ -32,7 +57,8 @@ def line(direction):
 
 
 def draw(direction, offset_px=0.0, *, depth=30.0, half_width=HALF_WIDTH, noise=0.0, upto_px=np.inf, at=(U, V), seed=0):
-    """An image of a straight device that lies `offset_px` beside the projected `line`, to its right seen along it, over a sloping background."""
+    """An image of a straight device that lies `offset_px` beside the projected `line`, to its right seen along it, over
+    a sloping background."""
     p, q = project(VIEW.P, line(direction)[0][[0, -1]])
     t = (q - p) / np.linalg.norm(q - p)
     across = (at[1] - p[1]) * t[0] - (at[0] - p[0]) * t[1] - offset_px
@@ -44,11 +70,13 @@ def draw(direction, offset_px=0.0, *, depth=30.0, half_width=HALF_WIDTH, noise=0
 
 def only(planes):
     """The arrays of the one plane looked at."""
-    return SimpleNamespace(**{k: v[0] if k != 'offsets_px' or isinstance(planes, Measurement) else v for k, v in vars(planes).items()})
+    return SimpleNamespace(**{k: v[0] if k != 'offsets_px' or isinstance(planes, Measurement) else v
+                              for k, v in vars(planes).items()})
 
 
 def strips_of(direction, image=None, field=FIELD, view=VIEW, reach=REACH, **drawing):
-    return cut(Sheet.of([draw(direction, **drawing) if image is None else image], [field], [view]), *line(direction), reach)
+    return cut(Sheet.of([draw(direction, **drawing) if image is None else image], [field], [view]),
+               *line(direction), reach)
 
 
 def measured(strips, on=None):
@@ -111,7 +139,8 @@ def test_presence_is_1_on_the_device_and_0_beyond_it():
 def test_outside_the_field_nothing_is_measured():
     field = FIELD.copy()
     field[:, 150:] = 0
-    strips = strips_of((-1, 0, 0), field=field, noise=0.5)        # u grows along it: the image shows the patient's right to the left
+    # u grows along it: the image shows the patient's right to the left
+    strips = strips_of((-1, 0, 0), field=field, noise=0.5)
     u = strips.centers_px[0, :, 0]
     assert (np.diff(u) > 0).all()
     inside = strips.inside[0]
@@ -122,11 +151,13 @@ def test_outside_the_field_nothing_is_measured():
 
 
 def test_speed_is_the_magnification_times_the_sine_of_the_ray():
-    for direction, sine in (((1, 0, 0), 1.0), ((1, 1, 0), np.sqrt(0.5)), ((0, 1, 2), 2 / np.sqrt(5))):    # the beam runs along y
+    # the beam runs along y
+    for direction, sine in (((1, 0, 0), 1.0), ((1, 1, 0), np.sqrt(0.5)), ((0, 1, 2), 2 / np.sqrt(5))):
         strips = only(strips_of(direction))
         middle = slice(95, 105)
         assert_allclose(strips.speed[middle], sine / PX, rtol=3e-3)
-        assert_allclose(np.einsum('ni,ni->n', strips.normals[middle], np.gradient(strips.centers_px, axis=0)[middle]), 0, atol=1e-3)
+        assert_allclose(np.einsum('ni,ni->n', strips.normals[middle], np.gradient(strips.centers_px, axis=0)[middle]),
+                        0, atol=1e-3)
 
 
 def test_a_sheet_samples_each_plane_as_if_it_were_alone():
@@ -143,7 +174,8 @@ def test_a_sheet_samples_each_plane_as_if_it_were_alone():
         lit = cv2.remap(fields[k], *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0) > 0
         inside = (at[0] > 0) & (at[0] < images[k].shape[1] - 1) & (at[1] > 0) & (at[1] < len(images[k]) - 1)
         assert inside.any() and not inside.all()
-        assert_allclose(sheet.sample(columns, rows, cv2.INTER_CUBIC)[k][inside], alone[inside], atol=2e-2)     # coordinates are rounded to 1/32 px
+        # coordinates are rounded to 1/32 px
+        assert_allclose(sheet.sample(columns, rows, cv2.INTER_CUBIC)[k][inside], alone[inside], atol=2e-2)
         assert_array_equal(sheet.exposed(columns, rows)[k], lit)
 
 
@@ -166,7 +198,8 @@ def test_strips_follow_a_distorted_image():
 def test_search_finds_a_line_far_off(offset):
     strips = strips_of((0, 0, 1), reach=REACH + 8, offset_px=offset, noise=2.0)
     found = searched(strips)
-    assert abs(np.median(found.offset_px) - offset) < 0.1 and np.mean(np.abs(found.offset_px - offset) < FOUND_PX) > 0.95
+    assert (abs(np.median(found.offset_px) - offset) < 0.1
+            and np.mean(np.abs(found.offset_px - offset) < FOUND_PX) > 0.95)
     assert np.isfinite(found.variance).mean() > 0.95
 
 
@@ -187,10 +220,12 @@ def test_a_shadow_by_hand():
         assert_allclose(y, y[::-1], atol=1e-9)
         assert y.max() == y[len(y) // 2] == pytest.approx(1, abs=1e-3)
         assert np.pi * h / 2 < y.sum() * 0.1 < np.pi * h / 2 * (1.8 if h < 2 else 1.25)
-    assert_allclose(shadow(20.0, np.array([0.0, 10.0, 15.0])), [1, np.sqrt(0.75), np.sqrt(1 - 0.75**2)], atol=5e-3)     # blur hardly shows
+    # blur hardly shows
+    assert_allclose(shadow(20.0, np.array([0.0, 10.0, 15.0])), [1, np.sqrt(0.75), np.sqrt(1 - 0.75**2)], atol=5e-3)
 
 
-@pytest.mark.parametrize('half_width, low, high', [(2.0, 0.995, 1.0), (1.5, 0.97, 1.0), (2.5, 0.97, 1.0), (5.0, 0.3, 0.86)])
+@pytest.mark.parametrize('half_width, low, high',
+                         [(2.0, 0.995, 1.0), (1.5, 0.97, 1.0), (2.5, 0.97, 1.0), (5.0, 0.3, 0.86)])
 def test_likeness_knows_the_devices_width(half_width, low, high):
     strips = strips_of((1, 0, 0), half_width=half_width, noise=1.0)
     assert low < alike(strips) <= high
@@ -207,7 +242,8 @@ def test_likeness_does_not_mind_noise_that_is_known():
     assert np.median(likeness(noisy, HALF_WIDTH)[:, own]) == pytest.approx(np.sqrt(0.5), abs=0.03)
     assert np.median(likeness(noisy, HALF_WIDTH, sigma)[:, own]) > 0.95
     assert likeness(noisy, HALF_WIDTH, 10 * sigma).max() <= 1       # more noise than there can be
-    assert np.median(np.abs(likeness(noisy + shadow(HALF_WIDTH, offsets), HALF_WIDTH, sigma)[:, own])) < 0.5     # what is nothing but noise stays so
+    # what is nothing but noise stays so
+    assert np.median(np.abs(likeness(noisy + shadow(HALF_WIDTH, offsets), HALF_WIDTH, sigma)[:, own])) < 0.5
 
 
 def test_a_bright_line_is_the_opposite_and_an_edge_is_unlike():
@@ -252,7 +288,8 @@ def test_pieces_are_medians_along_each_line_and_a_short_line_is_one():
 
 
 def darkened(*shares):
-    """(B, 9) profiles, square roots of counts, whose middle lacks each of the shares of a background that differs from piece to piece."""
+    """(B, 9) profiles, square roots of counts, whose middle lacks each of the shares of a background that differs from
+    piece to piece."""
     counts = np.full((len(shares), 9), 100.0) * np.arange(1, len(shares) + 1)[:, None]
     counts[:, 4] *= 1 - np.array(shares)
     return np.sqrt(counts)
@@ -260,7 +297,8 @@ def darkened(*shares):
 
 def test_contrast_by_hand():
     assert_allclose(contrast_of(darkened(0.2, 0.5)), [0.2, 0.5])
-    assert_allclose(straight_on(np.array([0.2, 0.36]), np.array([1.0, 0.5])), [0.2, 0.2])      # twice the path: 0.8^2 is left
+    # twice the path: 0.8^2 is left
+    assert_allclose(straight_on(np.array([0.2, 0.36]), np.array([1.0, 0.5])), [0.2, 0.2])
 
 
 def test_how_wide_a_line_looks_and_when_that_is_odd():
@@ -276,19 +314,23 @@ def test_how_wide_a_line_looks_and_when_that_is_odd():
 
 @pytest.mark.parametrize('direction', [(0.2, 0, 1), (1, 0, 0.4)])
 def test_clutter_is_what_noise_makes_of_a_line_that_is_not_there(direction):
-    """A matched filter of unit depth has the standard deviation noise / |shadow|, over `along` rows its root less; the device in the middle does not count."""
+    """A matched filter of unit depth has the standard deviation noise / |shadow|, over `along` rows its root less; the
+    device in the middle does not count."""
     shape = shadow(HALF_WIDTH, np.arange(-6, 7))
     for noise, depth in ((3.0, 0.0), (3.0, 60.0), (6.0, 0.0)):
         spread = clutter(strips_of(direction, noise=noise, depth=depth, reach=40), shape[None], 12.0, 3)
-        assert_allclose(spread, noise / np.linalg.norm(shape - shape.mean()) / np.sqrt(3), rtol=0.3)      # interpolation smooths a little
+        # interpolation smooths a little
+        assert_allclose(spread, noise / np.linalg.norm(shape - shape.mean()) / np.sqrt(3), rtol=0.3)
 
 
 def test_distortion_is_known_at_three_offsets_of_a_strip():
-    bent = replace(VIEW, distortion=Distortion('plumb_bob', decompose(VIEW.P)[0], np.array([-0.3, 0.1, 1e-3, -1e-3, 0.0]), np.eye(3)))
+    bent = replace(VIEW, distortion=Distortion('plumb_bob', decompose(VIEW.P)[0],
+                                               np.array([-0.3, 0.1, 1e-3, -1e-3, 0.0]), np.eye(3)))
     sheet = Sheet.of([draw((1, 0, 0.4))], [FIELD], [bent])
     centers, normals, _ = (x for x in lay_out([bent], *line((1, 0, 0.4))))
     offsets = np.arange(-20.0, 21.0)
     u, v = sheet.places(centers, normals, offsets)
-    exact = distort(bent, (centers[0][:, None] + normals[0][:, None] * offsets[:, None]).reshape(-1, 2)).reshape(-1, 41, 2)
+    exact = distort(bent, (centers[0][:, None] + normals[0][:, None] * offsets[:, None]).reshape(-1, 2)).reshape(-1, 41,
+                                                                                                                 2)
     inside = (exact[..., 1] > 0) & (exact[..., 1] < 255)
     assert np.abs(np.stack([u[0], v[0] - sheet.top[0]], axis=-1) - exact)[inside].max() < 0.01

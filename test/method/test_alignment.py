@@ -16,9 +16,10 @@ T = np.linspace(0, 1, 600)
 CURVES = {
     'monotone': np.c_[0.01 * np.sin(3 * T), 0.015 * T**2, 0.08 * T - 0.04],
     'slanted': np.c_[0.05 * T - 0.025, 0.03 * T - 0.015, 0.03 * T],
-    'tangent': np.c_[0.06 * T - 0.03, 0.01 * T, -0.08 * (T - 0.4)**2],                          # turns back in z: every line is met twice
+    'tangent': np.c_[0.06 * T - 0.03, 0.01 * T, -0.08 * (T - 0.4)**2],      # turns back in z: every line is met twice
     'screw': np.c_[0.02 * np.cos(6.5 * T), 0.02 * np.sin(6.5 * T) + 0.02 * T, 0.06 * T - 0.03],
-    'loop': np.c_[0.015 * np.sin(8.5 * T - 1) + 0.01 * T, 0.03 * T, 0.015 * np.cos(8.5 * T - 1)],       # crosses itself in plane A
+    # crosses itself in plane A
+    'loop': np.c_[0.015 * np.sin(8.5 * T - 1) + 0.01 * T, 0.03 * T, 0.015 * np.cos(8.5 * T - 1)],
 }
 
 
@@ -33,7 +34,8 @@ def match(a, b, **options):
 
 
 def apart(found, X):
-    """(K,) m between the two points of `X` that each matched pair stands for; a flipped line's arc length counts from its last point."""
+    """(K,) m between the two points of `X` that each matched pair stands for; a flipped line's arc length counts from
+    its last point."""
     ta, tb = (np.interp(s, arc_length(project(v.P, X)), T) for s, v in zip((found.along_a, found.along_b), VIEWS))
     return np.linalg.norm([np.interp(ta, T, c) - np.interp(tb, T, c) for c in X.T], axis=0)
 

@@ -17,7 +17,8 @@ SECOND = 1_000_000_000
 
 
 def was(points, stamp_ns=0):
-    return Prior(Shape(points, np.zeros(len(points)), np.zeros((len(points), 3, 3)), np.zeros((len(points), 2))), stamp_ns)
+    return Prior(Shape(points, np.zeros(len(points)), np.zeros((len(points), 3, 3)), np.zeros((len(points), 2))),
+                 stamp_ns)
 
 
 def test_nothing_is_said_of_what_is_not_known():
@@ -27,18 +28,21 @@ def test_nothing_is_said_of_what_is_not_known():
 
 @pytest.mark.parametrize('seconds', [1 / 60, 1 / 15, 1.0])
 def test_what_it_can_have_moved_by_costs_nothing(seconds):
-    assert continuity(LINE + [FASTEST * seconds, 0, 0], was(LINE), round(seconds * SECOND)) == pytest.approx(0, abs=1e-12)
+    assert (continuity(LINE + [FASTEST * seconds, 0, 0], was(LINE), round(seconds * SECOND))
+            == pytest.approx(0, abs=1e-12))
 
 
 def test_a_leap_is_as_likely_as_leaps_are():
     for seconds in (0.1, 1.0, 20.0):
-        assert_allclose(continuity(LINE + [50, 0, 0], was(LINE), round(seconds * SECOND)), np.log(1 - np.exp(-LEAPS * seconds)), rtol=1e-9, atol=1e-12)
+        assert_allclose(continuity(LINE + [50, 0, 0], was(LINE), round(seconds * SECOND)),
+                        np.log(1 - np.exp(-LEAPS * seconds)), rtol=1e-9, atol=1e-12)
 
 
 def test_beyond_its_reach_it_is_a_gaussian():
     seconds, reach = 0.1, FASTEST * 0.1 + TIP
     leap = 1 - np.exp(-LEAPS * seconds)
-    assert_allclose(continuity(LINE + [2.5 * reach, 0, 0], was(LINE), round(seconds * SECOND)), np.log(leap + (1 - leap) * np.exp(-0.5 * 1.5**2)), rtol=1e-9)
+    assert_allclose(continuity(LINE + [2.5 * reach, 0, 0], was(LINE), round(seconds * SECOND)),
+                    np.log(leap + (1 - leap) * np.exp(-0.5 * 1.5**2)), rtol=1e-9)
 
 
 def test_a_tip_that_leaps_along_the_device_counts_too():
@@ -46,10 +50,12 @@ def test_a_tip_that_leaps_along_the_device_counts_too():
 
 
 def test_what_is_found_elsewhere_needs_more_evidence_an_eye_blink_later_and_none_some_time_later():
-    frame = lambda stamp_ns: Frame(stamp_ns, 'cell', tuple(GOOD), tuple(make_view(name, P, SIZE, SIZE) for name, P in zip('ab', VIEWS)))      # noqa: E731
+    frame = lambda stamp_ns: Frame(stamp_ns, 'cell', tuple(GOOD),    # noqa: E731
+                                   tuple(make_view(name, P, SIZE, SIZE) for name, P in zip('ab', VIEWS)))
     config = Config.from_values(robot_radius=RADIUS, base_position=curve()[0].tolist(), min_confidence=0.01)
     alone, elsewhere = reconstruct(frame(SECOND), config), was(curve() + [0, 0.2, 0.2], 0)
-    confidence = [reconstruct(frame(stamp_ns), config, elsewhere).confidence for stamp_ns in (SECOND // 30, SECOND // 2, 60 * SECOND)]
+    confidence = [reconstruct(frame(stamp_ns), config, elsewhere).confidence
+                  for stamp_ns in (SECOND // 30, SECOND // 2, 60 * SECOND)]
     assert confidence[0] < confidence[1] < confidence[2] == pytest.approx(alone.confidence, abs=1e-6)
     strict = config.replace(min_confidence=0.5 * (confidence[0] + alone.confidence))
     result = reconstruct(frame(SECOND // 30), strict, elsewhere)

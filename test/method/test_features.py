@@ -23,7 +23,7 @@ VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
 PX = 0.3e-3
 DIAGONAL_PX = SIZE * np.sqrt(2)
 ROUNDING = 0.01        # OpenCV 4 interpolates at places rounded to 1/32 px
-LITTLE = 0.1            # what a display's offset may change: the square root of counts no longer makes their noise quite even
+LITTLE = 0.1    # what a display's offset may change: the square root of counts no longer makes their noise quite even
 
 
 @cache
@@ -68,8 +68,10 @@ def test_there_is_a_finite_number_for_every_name():
 
 @pytest.mark.parametrize('anatomy', [False, True])
 @pytest.mark.parametrize('planes', [(0,), (1,), (0, 1)])
-@pytest.mark.parametrize('change, atol', [(lambda i: 0.5 * i.astype(np.float32), 0.02), (lambda i: i.astype(np.uint16) * 200, 0.02),
-                                          (lambda i: 0.5 * i.astype(np.float32) + 40, LITTLE), (lambda i: i.astype(np.float32) + 40, LITTLE)],
+@pytest.mark.parametrize('change, atol', [(lambda i: 0.5 * i.astype(np.float32), 0.02),
+                                          (lambda i: i.astype(np.uint16) * 200, 0.02),
+                                          (lambda i: 0.5 * i.astype(np.float32) + 40, LITTLE),
+                                          (lambda i: i.astype(np.float32) + 40, LITTLE)],
                          ids=['gain', '16 bit', 'gain and offset', 'offset'])
 def test_gain_and_offset_of_either_display_tell_nothing(anatomy, planes, change, atol):
     images = [change(i) if k in planes else i for k, i in enumerate(scene(anatomy).frame.images)]
@@ -96,7 +98,7 @@ def test_a_mirrored_plane_says_the_same(anatomy, plane, axis):
 
 def test_a_curve_that_runs_the_other_way_says_nearly_the_same():
     sheet, f = fitted(scene(False).frame.images, way=-1)
-    assert_same(named(f, sheet, tip_is_last=False), expected(), LITTLE)       # its strips lie elsewhere by parts of a px
+    assert_same(named(f, sheet, tip_is_last=False), expected(), LITTLE)     # its strips lie elsewhere by parts of a px
 
 
 def test_which_end_is_the_tip_exchanges_what_is_said_of_the_ends():
@@ -113,8 +115,10 @@ def test_a_quarter_of_the_dose_halves_the_signal_to_noise():
     images = replace(run(False), exposure=Exposure(photons=Exposure().photons / 4)).scene().frame.images
     sheet, f = fitted(images)
     dim, clear = named(f, sheet), expected()
-    assert_allclose(clear['weakest'] - dim['weakest'], np.log(2), atol=0.25)        # the spread of some hundred places is known to a tenth
-    assert dim['residual'] > clear['residual'] and dim['sigma'] > clear['sigma'] and dim['tip_sigma'] > clear['tip_sigma']
+    # the spread of some hundred places is known to a tenth
+    assert_allclose(clear['weakest'] - dim['weakest'], np.log(2), atol=0.25)
+    assert (dim['residual'] > clear['residual'] and dim['sigma'] > clear['sigma']
+            and dim['tip_sigma'] > clear['tip_sigma'])
 
 
 def aside(f, px, plane=0):
@@ -149,7 +153,8 @@ def by_hand(points):
     _, f = known()
     spline = through(points, 0.005)
     s = np.arange(spline.start, spline.stop, PX)
-    return replace(f, spline=spline, start=0.0, stop=float(arc_length(points)[-1]), s=s, presence=np.ones((len(s), 2)), offset_px=np.zeros((len(s), 2)))
+    return replace(f, spline=spline, start=0.0, stop=float(arc_length(points)[-1]), s=s, presence=np.ones((len(s), 2)),
+                   offset_px=np.zeros((len(s), 2)))
 
 
 def test_what_the_fit_left_over_is_its_rms_in_the_worse_plane():
@@ -159,7 +164,8 @@ def test_what_the_fit_left_over_is_its_rms_in_the_worse_plane():
     assert_allclose(named(replace(f, offset_px=left + [0.4, -1.2]), sheet)['residual'], 1.2)
     every_second = np.where(np.arange(len(f.s))[:, None] % 2, 1.0, np.nan)
     assert_allclose(named(replace(f, offset_px=left + every_second), sheet)['residual'], 1.0)
-    assert named(replace(f, offset_px=left + np.nan), sheet)['residual'] == named(replace(f, offset_px=left + 9.0), sheet)['residual'] == 3.0
+    assert (named(replace(f, offset_px=left + np.nan), sheet)['residual']
+            == named(replace(f, offset_px=left + 9.0), sheet)['residual'] == 3.0)
 
 
 @pytest.mark.parametrize('anatomy', [False, True])
@@ -167,8 +173,10 @@ def test_what_the_fit_left_over_is_its_rms_in_the_worse_plane():
 def test_a_curve_that_is_cut_short_is_seen_to_go_on(anatomy, share):
     sheet, f = known(anatomy)
     whole, step = expected(anatomy), share * (f.stop - f.start)
-    no_tip, no_base = (named(replace(f, **cut), sheet) for cut in (dict(stop=f.start + step), dict(start=f.stop - step)))
-    assert whole['tip_stops'] > 0.6 > 0.25 > no_tip['tip_stops'] and no_base['tip_stops'] > 0.5      # what its base does says nothing
+    no_tip, no_base = (named(replace(f, **cut), sheet)
+                       for cut in (dict(stop=f.start + step), dict(start=f.stop - step)))
+    # what its base does says nothing
+    assert whole['tip_stops'] > 0.6 > 0.25 > no_tip['tip_stops'] and no_base['tip_stops'] > 0.5
     assert_allclose([no_tip['length'], no_base['length']], whole['length'] + np.log(share), atol=0.02)
 
 
@@ -187,7 +195,8 @@ def test_what_one_plane_does_not_show_is_a_share_of_the_blocks(plane):
     hidden = there[plane].copy()
     far = slice(None, int(uv[1])) if uv[0] < uv[1] else slice(int(uv[1]) + 1, None)        # the base's half
     hidden[:, far] = gone[plane][:, far]
-    sheet = sheet_of([hidden if k == plane else i for k, i in enumerate(there)], [field_of_view(i) for i in there], VIEWS, 'dark')
+    sheet = sheet_of([hidden if k == plane else i for k, i in enumerate(there)], [field_of_view(i) for i in there],
+                     VIEWS, 'dark')
     half, whole = named(f, sheet), expected()
     assert_allclose(half['seen'], 0.5, atol=0.15)
     assert half['weakest'] < whole['weakest'] - 1
@@ -206,8 +215,10 @@ def test_the_shape_by_hand():
     sheet, f = known()
     angle = np.linspace(-0.6, 0.6, 300)
     arc = 0.04 * np.c_[np.zeros(300), np.sin(angle), np.cos(angle) - 1]
-    turned, straight = named(by_hand(resample(arc, PX)[0]), sheet), named(by_hand(np.c_[np.zeros((200, 2)), np.linspace(-0.03, 0.03, 200)]), sheet)
-    assert_allclose([turned['length'], straight['length']], np.log(np.array([0.048, 0.06]) / PX / DIAGONAL_PX), atol=0.02)
+    turned, straight = (named(by_hand(resample(arc, PX)[0]), sheet),
+                        named(by_hand(np.c_[np.zeros((200, 2)), np.linspace(-0.03, 0.03, 200)]), sheet))
+    assert_allclose([turned['length'], straight['length']], np.log(np.array([0.048, 0.06]) / PX / DIAGONAL_PX),
+                    atol=0.02)
 
 
 

@@ -16,7 +16,8 @@ T = np.linspace(0, 1, 800)
 CURVES = {
     'straight': np.c_[0.03 * T - 0.015, 0.02 * T - 0.01, 0.06 * T - 0.03],
     'monotone': np.c_[0.01 * np.sin(3 * T), 0.015 * T**2, 0.08 * T - 0.04],
-    'tangent': np.c_[0.06 * T - 0.03, 0.01 * T, -0.08 * (T - 0.4)**2],      # its tangents lie in their epipolar planes near the middle
+    # its tangents lie in their epipolar planes near the middle
+    'tangent': np.c_[0.06 * T - 0.03, 0.01 * T, -0.08 * (T - 0.4)**2],
     'loop': np.c_[0.02 * np.cos(6 * T), 0.02 * np.sin(6 * T) + 0.02 * T, 0.06 * T - 0.03],
 }
 

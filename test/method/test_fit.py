@@ -1,4 +1,5 @@
-"""A spline fitted to rendered X-ray pairs with known truth: where it lies, where it ends, and what it knows of its errors."""
+"""A spline fitted to rendered X-ray pairs with known truth: where it lies, where it ends, and what it knows of its
+errors."""
 
 from dataclasses import replace
 
@@ -77,7 +78,8 @@ def test_from_a_start_px_off_it_settles_on_the_device(frame, truth, off_px):
 
 def test_what_it_says_of_the_device(frame, truth):
     f = fitted(frame, truth)
-    assert_allclose(f.across, EXPOSURE.contrast, atol=0.04)     # of the beam along its axis, whatever its slant; blur leaves less
+    # of the beam along its axis, whatever its slant; blur leaves less
+    assert_allclose(f.across, EXPOSURE.contrast, atol=0.04)
     between = (f.s > f.start) & (f.s < f.stop)
     assert (f.presence[between] > 0.4).mean(axis=0).min() > 0.97
     inside = (f.s > f.start + 5 * PX) & (f.s < f.stop - 5 * PX)
@@ -90,7 +92,8 @@ def test_a_start_that_runs_the_other_way_gives_the_same_curve(frame, truth):
     there, back = (fitted(frame, points) for points in (truth, truth[::-1]))
     assert_allclose(ends(there), ends(back)[::-1], atol=0.05e-3)
     u = np.linspace(there.start, there.stop, 100)
-    assert np.linalg.norm(nearest(there.spline(u), back.spline(np.linspace(back.start, back.stop, 3000))), axis=1).max() < 0.02e-3
+    assert np.linalg.norm(nearest(there.spline(u), back.spline(np.linspace(back.start, back.stop, 3000))),
+                          axis=1).max() < 0.02e-3
 
 
 @pytest.mark.parametrize('lost', [0.004, 0.012, 0.025])
@@ -103,7 +106,8 @@ def test_a_start_that_is_too_short_grows_to_the_end(frame, truth, end, lost):
 
 
 def photographed(points, lines=()):
-    """A frame of a device of 0.6 mm radius along (N, 3) points, and of `lines`, (M, 3) points and whether each plane shows them."""
+    """A frame of a device of 0.6 mm radius along (N, 3) points, and of `lines`, (M, 3) points and whether each plane
+    shows them."""
     images = []
     for k, view in enumerate(VIEWS):
         light = transmission(points, 0.0006, view, EXPOSURE)
@@ -186,8 +190,10 @@ def test_the_covariance_is_that_of_the_scatter_over_noise(run, truth):
         x = np.einsum('kij,kj->ki', N, nearest(f.spline(u), truth))
         square += np.einsum('ki,kij,kj->k', x, np.linalg.inv(lateral(f, u, N)), x).tolist()
         tangent = f.spline(np.array([f.start, f.stop]), 1)
-        along.append(np.einsum('ki,ki->k', ends(f) - truth[[0, -1]], tangent) / np.linalg.norm(tangent, axis=1) / f.end_sigma)
-    # two degrees of freedom each; neighbours share errors, and what the model is worth does not scatter: not far above 1, not near 0
+        along.append(np.einsum('ki,ki->k', ends(f) - truth[[0, -1]], tangent)
+                     / np.linalg.norm(tangent, axis=1) / f.end_sigma)
+    # two degrees of freedom each; neighbours share errors, and what the model is worth does not scatter: not far above
+    # 1, not near 0
     assert 0.2 < np.mean(square) / 2 < 1.6
     assert np.mean(np.array(square) < 5.99) > 0.9       # chi square, 95 %
     assert 0.1 < np.mean(np.square(along)) < 2.0
@@ -201,7 +207,8 @@ def worst_variances(f):
 
 
 def test_less_dose_is_known_less_well(run, truth, frame):
-    dim = replace(run, exposure=Exposure(photons=150)).scene().frame        # ten times the variance, less what the model is worth
+    # ten times the variance, less what the model is worth
+    dim = replace(run, exposure=Exposure(photons=150)).scene().frame
     assert (worst_variances(fitted(dim, truth)) > 2 * worst_variances(fitted(frame, truth))).all()
 
 
@@ -235,6 +242,7 @@ def test_a_start_anywhere_gives_no_fit_or_a_finite_one(kind):
     """Far from the device, across it, and much too short."""
     scene = xray_run(0, views=VIEWS, lengths=(0.06, 0.07), anatomy=False, device=load_device(kind)).scene()
     middle_of = scene.truth[len(scene.truth) // 2]
-    for points in (scene.truth[::-1][:20], middle_of + np.linspace(-0.03, 0.03, 60)[:, None] * [0.3, 0.9, 0.1], scene.truth + 0.004, scene.truth[30:60]):
+    for points in (scene.truth[::-1][:20], middle_of + np.linspace(-0.03, 0.03, 60)[:, None] * [0.3, 0.9, 0.1],
+                   scene.truth + 0.004, scene.truth[30:60]):
         f = fitted(scene.frame, points)
         assert f is None or np.isfinite([f.start, f.stop, *f.end_sigma, *f.farther]).all()

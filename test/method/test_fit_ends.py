@@ -31,9 +31,11 @@ def stretch(presence, clutter=0.1):
     ([(50, 149)], [(50, 149)], (50, 149)),
     ([(50, 149)], [(80, 189)], (80, 149)),                                              # what both show
     ([(50, 149), (170, 299)], [(50, 149), (170, 299)], (50, 299)),                      # 20 px of nothing: bridged
-    ([(50, 149), (350, 399)], [(50, 149), (350, 399)], (50, 149)),                      # 200 px of nothing: one of the two pieces
+    # 200 px of nothing: one of the two pieces
+    ([(50, 149), (350, 399)], [(50, 149), (350, 399)], (50, 149)),
     ([(50, 299)], [(50, 149), (200, 299)], (50, 299)),                                  # 50 px hidden in one plane
-    ([(20, 119), (150, 157)], [(20, 119), (150, 157)], (20, 157)),                      # a band 30 px past the end of what is seen
+    # a band 30 px past the end of what is seen
+    ([(20, 119), (150, 157)], [(20, 119), (150, 157)], (20, 157)),
     ([(20, 119), (150, 157)], [(20, 119)], (20, 119)),                                  # which only one plane shows
     ([(20, 119), (250, 257)], [(20, 119), (250, 257)], (20, 119)),                      # or too far off
 ])
@@ -106,7 +108,8 @@ def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):
 
 def placed(s, presence, sigma, speed, guess, outward, beyond):
     """m: where the device ends, and its standard deviation."""
-    end, = locate(s[None], presence.T[None], sigma[None], speed.T[None], np.array([guess]), np.array([outward]), beyond[None], np.zeros((1, 2)))
+    end, = locate(s[None], presence.T[None], sigma[None], speed.T[None], np.array([guess]), np.array([outward]),
+                  beyond[None], np.zeros((1, 2)))
     return end.at, end.honest_sigma
 
 
@@ -133,7 +136,8 @@ def test_sigma_is_the_scatter_over_noise(noise):
     z, n = [], 120
     for seed in range(n):
         end = (90 + 0.173 * seed) * PX
-        at, sigma = placed(S, edge(end, noise=noise, seed=seed), np.full(2, noise), SPEED, end + (seed % 7 - 3) * PX, 1, NONE)
+        at, sigma = placed(S, edge(end, noise=noise, seed=seed), np.full(2, noise), SPEED,
+                           end + (seed % 7 - 3) * PX, 1, NONE)
         z.append((at - end) / sigma)
     # chi square with 120 degrees of freedom over 120: 1 +- 0.13; the floor of the model makes it less
     assert 0.5 < np.mean(np.square(z)) < 1.4
@@ -146,7 +150,8 @@ def test_where_the_planes_differ_the_less_foreshortened_one_counts_more():
     p = edge([end, end - 0.8 * PX])
 
     def at(ramp_px):
-        found, = locate(S[None], p.T[None], np.full((1, 2), 0.02), SPEED.T[None], np.array([end]), np.array([1]), NONE[None], np.array([ramp_px]) * PX)
+        found, = locate(S[None], p.T[None], np.full((1, 2), 0.02), SPEED.T[None], np.array([end]), np.array([1]),
+                        NONE[None], np.array([ramp_px]) * PX)
         return found.at
 
     assert abs(at([0.0, 5.0]) - end) < 0.15 * PX                # the model of plane B's end is worth half a px
@@ -179,10 +184,13 @@ def test_planes_that_disagree_widen_sigma_by_half_their_difference(apart_px):
 
 def test_bulge_by_hand():
     ones = np.ones(2)
-    assert_allclose(bulge(0.001, ones, ones, np.array([0.9, 0.2])), 0, atol=1e-12)                      # seen square on: nothing
-    slanted, opaque = np.full(2, np.sqrt(0.5)), np.array([0.9, 0.9])                                    # 45 degrees: cos / sin = 1
+    # seen square on: nothing
+    assert_allclose(bulge(0.001, ones, ones, np.array([0.9, 0.2])), 0, atol=1e-12)
+    # 45 degrees: cos / sin = 1
+    slanted, opaque = np.full(2, np.sqrt(0.5)), np.array([0.9, 0.9])
     reach = bulge(0.001, slanted, ones, opaque)
-    assert (reach > 0.6e-3).all() and (reach < 0.25e-3 * np.pi).all()   # an ellipse reaches r at its middle, pi / 4 r on average
+    # an ellipse reaches r at its middle, pi / 4 r on average
+    assert (reach > 0.6e-3).all() and (reach < 0.25e-3 * np.pi).all()
     assert_allclose(bulge(0.002, np.full(2, 0.6) * 3000, ones * 3000, opaque), reach * 2 * 0.8 / 0.6)
     half = np.log(1 - 0.5 * 0.3) / np.log(1 - 0.3)      # Beer-Lambert: the share of the path that takes half of 30 %
     assert_allclose(bulge(0.001, slanted, ones, np.array([0.3, 1e-4])), [0.5e-3 * (1 - 2 * half), 0], atol=3e-6)

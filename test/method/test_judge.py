@@ -25,7 +25,8 @@ SIGN = np.array([SIGNS[n] for n in NAMES])
 EVERY = dict.fromkeys(NAMES, 1.0)
 
 
-A, B, C = next(n for n in NAMES if SIGNS[n] > 0), next(n for n in NAMES if SIGNS[n] < 0), NAMES[-1]     # some features, the first two of different sign
+# some features, the first two of different sign
+A, B, C = next(n for n in NAMES if SIGNS[n] > 0), next(n for n in NAMES if SIGNS[n] < 0), NAMES[-1]
 
 
 def by_hand(bias=0.0, offset=0.0, slope=1.0, far={}, **near):       # noqa: B006 (never changed)
@@ -47,7 +48,8 @@ def share(z):
 
 
 def test_a_feature_counts_by_how_much_worse_than_typical_it_is():
-    model = replace(by_hand(2.0, **{A: 3.0, B: 1.0}, far={B: 0.5}), typical=worse(**{B: 0.2}), scale=np.where(np.array(NAMES) == A, 2.0, 1.0))
+    model = replace(by_hand(2.0, **{A: 3.0, B: 1.0}, far={B: 0.5}), typical=worse(**{B: 0.2}),
+                    scale=np.where(np.array(NAMES) == A, 2.0, 1.0))
     assert model.log_odds(model.typical) == model.log_odds(worse(**{A: 2 * NEAR, B: 0.2 + 0.99 * NEAR})) == 2
     assert_allclose(model.log_odds(worse(**{A: 2 * (NEAR + 0.5), B: 0.2})), 2 - 3 * 0.5)
     assert_allclose(model.log_odds(worse(**{B: 0.2 + FAR})), 2 - (FAR - NEAR))
@@ -104,8 +106,10 @@ def test_every_feature_has_a_sign_and_words_and_stands_in_the_file():
     assert set(NAMES) == set(SIGNS) == set(REASONS) == set(content['features'])
     assert set(SIGNS.values()) == {-1, 1}
     assert len(set(REASONS.values())) == N and not any('\n' in why or why.endswith('.') for why in REASONS.values())
-    numbers = [content[k] for k in ('bias', 'offset', 'slope')] + [x for t in content['features'].values() for x in t.values()]
-    assert np.isfinite(numbers).all() and all(t['scale'] > 0 <= min(t['near'], t['far']) for t in content['features'].values())
+    numbers = [content[k] for k in ('bias', 'offset', 'slope')] + [x for t in content['features'].values()
+                                                                   for x in t.values()]
+    assert np.isfinite(numbers).all() and all(t['scale'] > 0 <= min(t['near'], t['far'])
+                                              for t in content['features'].values())
     assert 'seed' in json.dumps(content)        # where it comes from
 
 
@@ -136,7 +140,8 @@ def test_a_typical_right_fit_is_believed_and_one_that_is_worse_in_all_respects_i
 def test_confidence_is_a_probability_that_grows_with_the_odds(model):
     p = [0.0, 1e-15, 1e-6, 0.01, 0.3, 0.5, 0.9, 0.9999, 1.0]
     confidence = [model.confidence(x) for x in p]
-    assert (np.diff(confidence[2:-1]) > 0).all() and (np.diff(confidence) >= 0).all() and 0 < confidence[0] and confidence[-1] < 1
+    assert ((np.diff(confidence[2:-1]) > 0).all() and (np.diff(confidence) >= 0).all() and 0 < confidence[0]
+            and confidence[-1] < 1)
     certain = [model.settles(z, 0.9) for z in np.linspace(-50, 50, 1001)]
     assert not certain[0] and certain[-1] and np.count_nonzero(np.diff(certain)) == 1
 
@@ -149,9 +154,11 @@ BIAS = 2.0
 
 
 def scenes(count, each=1, first=0, rng=0, worth=WORTH):
-    """So many scenes with `each` curves of normal features, right with ln odds BIAS less what is worse than 0 costs; seeds from `first`."""
+    """So many scenes with `each` curves of normal features, right with ln odds BIAS less what is worse than 0 costs;
+    seeds from `first`."""
     rng = np.random.default_rng(rng)
-    return [Curves('drawn', first + k, True, x, rng.random(each) < share(true_log_odds(x, worth)), ~np.eye(each, dtype=bool))
+    return [Curves('drawn', first + k, True, x, rng.random(each) < share(true_log_odds(x, worth)),
+                   ~np.eye(each, dtype=bool))
             for k, x in enumerate(rng.normal(0, 2, (count, each, N)))]
 
 
@@ -174,7 +181,8 @@ def test_a_logistic_model_is_learnt_from_what_it_made(learnt):
 
 
 def test_what_is_learnt_is_honest_on_scenes_that_it_has_not_seen(learnt):
-    found = [(learnt.confidence(p), right) for p, right in (chosen_of(learnt, s) for s in scenes(4000, first=10**6, rng=8))]
+    found = [(learnt.confidence(p), right)
+             for p, right in (chosen_of(learnt, s) for s in scenes(4000, first=10**6, rng=8))]
     confidence, right = np.array(found).T
     for low, high in ((0.0, 0.3), (0.3, 0.7), (0.7, 1.0)):
         among = (confidence > low) & (confidence < high)
@@ -198,7 +206,8 @@ def test_learning_is_deterministic_and_does_not_care_for_scenes_where_nothing_wa
 def test_the_more_curves_were_tried_in_a_scene_the_less_each_counts():
     """Wrong curves four times over are no more than twice as much: the odds fall by ln 2 at most, not by ln 4."""
     x = scenes(3000)
-    again = [s if s.right[0] else replace(s, features=s.features.repeat(4, axis=0), right=s.right.repeat(4), clash=np.zeros((4, 4), bool)) for s in x]
+    again = [s if s.right[0] else replace(s, features=s.features.repeat(4, axis=0), right=s.right.repeat(4),
+                                          clash=np.zeros((4, 4), bool)) for s in x]
     once, often = (judge_of(learn(given)) for given in (x, again))
     assert_allclose(once.bias - often.bias, np.log(2), atol=0.2)
 
@@ -234,7 +243,8 @@ def test_calibration_mends_a_judge_that_is_too_sure_or_too_modest(by):
 def test_of_curves_that_lie_apart_one_is_chosen_by_bayes_rule():
     """Odds 1, e and e^2; the first coincides with the third, so that it does not compete."""
     model, features = by_hand(2.0, **{A: 1.0}), np.stack([worse(**{A: v}) for v in (NEAR + 2, NEAR + 1, 0.0)])
-    x = Curves('drawn', 0, True, features, np.array([False, False, True]), np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool))
+    x = Curves('drawn', 0, True, features, np.array([False, False, True]),
+               np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], bool))
     p, right = chosen_of(model, x)
     assert right and p == pytest.approx(np.e**2 / (1 + np.e + np.e**2))
     p, right = chosen_of(model, replace(x, clash=~np.eye(3, dtype=bool), right=np.array([True, True, False])))
@@ -246,7 +256,7 @@ def test_right_is_as_near_as_the_confidence_promises():
     until = lambda lost: line[line[:, 2] < 0.05 - lost]     # noqa: E731
     assert all(is_right(points, line, 1e-4) for points in (line, line + [0.9 * MEAN, 0, 0], until(0.7 * TIP)))
     assert not any(is_right(points, line, 1e-4) for points in (line[::-1], line + [1.1 * MEAN, 0, 0], until(1.3 * TIP)))
-    assert is_right(line + [1.5 * MEAN, 0, 0], line, 2 * MEAN / MEAN_PX)        # a px at the device, where that is larger
+    assert is_right(line + [1.5 * MEAN, 0, 0], line, 2 * MEAN / MEAN_PX)    # a px at the device, where that is larger
 
 
 # ---- the command and the picture
@@ -254,7 +264,8 @@ def test_right_is_as_near_as_the_confidence_promises():
 
 def test_the_command_says_where_there_is_too_little_to_learn_from(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(bench_judge, 'FAMILIES', {'p_xray': 1})
-    assert main.main(['judge', '--scenes', '1', '--first-seed', '7', '--jobs', '1', '--out', str(tmp_path / 'judge.json')]) == 1
+    assert main.main(['judge', '--scenes', '1', '--first-seed', '7', '--jobs', '1', '--out',
+                      str(tmp_path / 'judge.json')]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert 'too few to learn from' in said and not (tmp_path / 'judge.json').exists()
 
@@ -262,7 +273,7 @@ def test_the_command_says_where_there_is_too_little_to_learn_from(monkeypatch, t
 def test_tasks_are_shares_of_the_families_that_exist():
     tasks = bench_judge.tasks(2, 100, Sources())
     count = {name: sum(t.family == name for t in tasks) for name in bench_judge.FAMILIES}
-    assert count['ct'] == 0 and count['wide'] == 24 and count['clutter'] == 4 and count['p_xray'] == 1      # no CT is given
+    assert count['ct'] == 0 and count['wide'] == 24 and count['clutter'] == 4 and count['p_xray'] == 1  # no CT is given
     assert {t.seed for t in tasks if t.family == 'clutter'} == set(range(100, 104))
 
 
@@ -271,7 +282,8 @@ def test_the_reliability_diagram_shows_silent_failures_in_their_colour(tmp_path)
     from fluoro_shape_ros.bench.plot_confidence import draw
 
     def red_pixels(tip):
-        answers = [Answer(k, Outcome.OK, errors=Errors(1e-4, 0.0, 0.0, tip, 0.0, 0.0), confidence=0.5 + k / 40) for k in range(20)]
+        answers = [Answer(k, Outcome.OK, errors=Errors(1e-4, 0.0, 0.0, tip, 0.0, 0.0), confidence=0.5 + k / 40)
+                   for k in range(20)]
         draw([*answers, Answer(21, Outcome.LOW_CONFIDENCE)], tmp_path / 'confidence.png')
         image = cv2.imread(str(tmp_path / 'confidence.png')).astype(int)
         assert image.shape[1] == 1200 and image.std() > 5

@@ -13,7 +13,21 @@ from fluoro_shape_ros.geometry.cameras import distort, project
 from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.imaging.prepare import sheet_of
 from fluoro_shape_ros.method.fit.fit import fit
-from fluoro_shape_ros.method.known_device import AGAINST, ALIKE, FOR, LENGTH, MOST, SHARE, STEP, SURE, TOGETHER_PX, Likeness, expected, likeness, verdict
+from fluoro_shape_ros.method.known_device import (
+    AGAINST,
+    ALIKE,
+    FOR,
+    LENGTH,
+    MOST,
+    SHARE,
+    STEP,
+    SURE,
+    TOGETHER_PX,
+    Likeness,
+    expected,
+    likeness,
+    verdict,
+)
 from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.method.tip import tip_is_last
 from fluoro_shape_ros.sim.carm import CArm, biplane
@@ -22,7 +36,8 @@ from fluoro_shape_ros.sim.scenes import xray_run
 PX = 0.3e-3
 VIEWS = biplane(arm=CArm(pixel_size_iso=PX, width=512, height=512))
 STEPPED = Device((Segment(0.030, 0.0007, 'metal', 0.0005), Segment(REST, 0.0010, 'metal', 0.0006)))
-RINGED = Device((Segment(REST, 0.0008, 110.0),), bands=tuple(Ring(at, 0.002, 0.0009, 'platinum') for at in (0.002, 0.006, 0.010)))
+RINGED = Device((Segment(REST, 0.0008, 110.0),),
+                bands=tuple(Ring(at, 0.002, 0.0009, 'platinum') for at in (0.002, 0.006, 0.010)))
 ROD = Device((Segment(REST, 0.0008, 'metal'),))
 WHOLE = [np.full((512, 512), 255, np.uint8)] * 2
 MIDDLE = 1e-7           # m to either side of it, as good as nothing
@@ -32,7 +47,8 @@ def scene_of(device, seed=0):
     return xray_run(seed, views=VIEWS, lengths=(0.06, 0.07), anatomy=False, device=device).scene()
 
 
-@pytest.fixture(scope='module', params=[STEPPED, RINGED, load_device('coil'), load_device('ep')], ids=['stepped', 'ringed', 'coil', 'ep'])
+@pytest.fixture(scope='module', params=[STEPPED, RINGED, load_device('coil'), load_device('ep')],
+                ids=['stepped', 'ringed', 'coil', 'ep'])
 def seen(request):
     """A device whose ends differ, and a scene of it."""
     return request.param, scene_of(request.param)
@@ -40,7 +56,8 @@ def seen(request):
 
 def said(device, scene, images=None, reverse=False):
     images = scene.frame.images if images is None else images
-    return likeness(device, scene.truth[::-1 if reverse else 1], sheet_of(images, WHOLE, VIEWS, 'dark'), visible_radius(device))
+    return likeness(device, scene.truth[::-1 if reverse else 1], sheet_of(images, WHOLE, VIEWS, 'dark'),
+                    visible_radius(device))
 
 
 # ---- what is expected
@@ -88,7 +105,8 @@ def test_the_tip_is_told_from_the_base_whichever_way_the_curve_runs(seen):
     assert_allclose(back.last_is_tip, -there.last_is_tip, rtol=0.1)
 
 
-@pytest.mark.parametrize('display', [lambda i: 2.5 * i, lambda i: 255 * (i / 255)**0.6, lambda i: 255 * (i / 255)**1.8, lambda i: 50 * np.log(i)],
+@pytest.mark.parametrize('display', [lambda i: 2.5 * i, lambda i: 255 * (i / 255)**0.6, lambda i: 255 * (i / 255)**1.8,
+                                     lambda i: 50 * np.log(i)],
                          ids=['gain', 'brighter', 'darker', 'logarithm'])
 def test_a_display_does_not_exchange_them(seen, display):
     device, scene = seen
@@ -130,7 +148,8 @@ def test_what_is_hidden_says_no_more_than_so_much(where):
     after = said(STEPPED, scene, images)
     hidden_px = 9 * np.sqrt(2) + 14     # and what is blurred
     assert after.last_is_tip > SURE
-    assert abs(after.last_is_tip - before.last_is_tip) < 0.5 * MOST**2 * hidden_px / TOGETHER_PX + 0.25 * abs(before.last_is_tip)    # scatter is measured anew
+    assert (abs(after.last_is_tip - before.last_is_tip)
+            < 0.5 * MOST**2 * hidden_px / TOGETHER_PX + 0.25 * abs(before.last_is_tip))    # scatter is measured anew
 
 
 def test_a_curve_too_short_or_outside_the_images_tells_nothing():
@@ -157,7 +176,8 @@ def test_the_description_counts_before_a_guess_and_after_what_is_known():
     of = lambda nats: lambda: Likeness(-nats, 0.0, -9.0)        # noqa: E731
     assert tip_is_last(ENDS, (False, False), border, alike=of(SURE + 0.1)) == (True, False)
     assert tip_is_last(ENDS, (False, False), border, alike=of(-SURE - 0.1)) == (False, False)
-    assert tip_is_last(ENDS, (False, False), border, alike=of(SURE - 0.1)) == (False, True)     # not sure: a guess, and said to be one
+    # not sure: a guess, and said to be one
+    assert tip_is_last(ENDS, (False, False), border, alike=of(SURE - 0.1)) == (False, True)
     assert tip_is_last(ENDS, (False, False), border, previous=LINE[::-1], alike=of(9.0)) == (False, False)
     assert tip_is_last(ENDS, (False, False), border, base_position=ENDS[1], alike=of(9.0)) == (False, False)
     assert tip_is_last(ENDS, (False, True), border, alike=of(9.0)) == (False, False)
@@ -184,7 +204,8 @@ def test_a_length_that_is_right_speaks_for_it_and_a_wrong_one_by_its_deviation(r
     square = 0.008**2 / (LENGTH**2 + (SHARE * device.length)**2)
     assert_allclose(verdict(device, lambda: ALIKE, f, True)[0], FOR - square / 2)
     found, words = verdict(of_length(f, 0.1), lambda: ALIKE, f, True, 'mine')
-    assert found == AGAINST and words == f'it is {1e3 * (f.stop - f.start):.0f} mm long, and mine {1e3 * (f.stop - f.start) + 100:.0f} mm'
+    assert (found == AGAINST and words == f'it is {1e3 * (f.stop - f.start):.0f} mm long, '
+                                          f'and mine {1e3 * (f.stop - f.start) + 100:.0f} mm')
 
 
 def test_a_device_that_leaves_the_field_may_be_longer_but_not_shorter(rod_fit):
@@ -221,7 +242,8 @@ def test_the_description_takes_the_place_of_radius_and_base(seed, method):
     """A pair whose tip is farther from the border than its base, as a guess has it, and one where it is not."""
     scene = scene_of(load_device('coil'), seed)
     guessed = reconstruct(scene.frame, Config.from_values(robot_radius=0.00045))
-    assert guessed.warnings == ('tip_ambiguous',) and np.linalg.norm(guessed.shape.tip - scene.truth[(-1, 0)[seed]]) < 1e-3
+    assert (guessed.warnings == ('tip_ambiguous',)
+            and np.linalg.norm(guessed.shape.tip - scene.truth[(-1, 0)[seed]]) < 1e-3)
     found = reconstruct(scene.frame, Config.from_values(device='coil', robot_radius=0.01, method=method))
     assert found.outcome is Outcome.OK and found.warnings == ()
     assert np.linalg.norm(found.shape.tip - scene.truth[-1]) < 2e-3
@@ -236,7 +258,8 @@ def test_a_curve_that_contradicts_the_description_is_refused_in_words(tmp_path):
     right = reconstruct(scene.frame, Config.from_values(device=file_of(tmp_path, known), min_confidence=0.9))
     assert right.outcome is Outcome.OK and right.confidence > same.confidence
     for text, words in ((known.replace(f'{length:.4f}', '0.2000'), 'mm long, and'),
-                        (known.replace('material: metal', 'attenuation: 110') + '\nbands: [{at: 0.002, length: 0.004, radius: 0.0009, material: platinum, every: 0.012}]',
+                        (known.replace('material: metal', 'attenuation: 110')
+                         + '\nbands: [{at: 0.002, length: 0.004, radius: 0.0009, material: platinum, every: 0.012}]',
                          'it does not look like')):
         device = file_of(tmp_path, text)
         found = reconstruct(scene.frame, Config.from_values(device=device, min_confidence=0.97))

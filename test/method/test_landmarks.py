@@ -17,7 +17,8 @@ from fluoro_shape_ros.method.pipeline import reconstruct
 
 A, B = (make_view(name, P, SIZE, SIZE) for name, P in zip('ab', VIEWS))
 MM = 1e-3
-UP, LEVEL = (np.linspace(-50, 50, 101)[:, None] * MM * np.array(d) for d in ([0.0, 0.0, 1.0], [0.5**0.5, 0.5**0.5, 0.0]))     # across epipolar lines, and along one
+UP, LEVEL = (np.linspace(-50, 50, 101)[:, None] * MM * np.array(d)
+             for d in ([0.0, 0.0, 1.0], [0.5**0.5, 0.5**0.5, 0.0]))     # across epipolar lines, and along one
 
 
 def fitted(points, seen_at=None, presence=None, offset_px=(0.0, 0.0)):
@@ -26,7 +27,8 @@ def fitted(points, seen_at=None, presence=None, offset_px=(0.0, 0.0)):
     s = np.arange(0, length, MM)
     presence = np.ones((len(s), 2)) if presence is None else presence(s)
     sigma = None if seen_at is None else np.full((2, 2), 0.3 * MM)
-    given = dict(spline=spline, start=5 * MM, stop=length - 5 * MM, s=s, presence=presence, offset_px=np.tile(offset_px, (len(s), 1)), seen_at=seen_at, seen_sigma=sigma)
+    given = dict(spline=spline, start=5 * MM, stop=length - 5 * MM, s=s, presence=presence,
+                 offset_px=np.tile(offset_px, (len(s), 1)), seen_at=seen_at, seen_sigma=sigma)
     return Fit(**{field.name: given.get(field.name) for field in fields(Fit)})
 
 
@@ -78,7 +80,8 @@ def test_bands_that_the_planes_see_at_different_places(moved):
     assert found.kinds == ('steps',)
     px, sigma = apart(found)
     at_start = apart(landmarks(fitted(UP, np.array([[5.0, 5.0 + moved], [95.0, 95.0]]) * MM), (A, B), True))[0][0]
-    assert px[0] == pytest.approx(at_start, abs=0.1) and abs(px[0]) == pytest.approx(abs(moved), abs=0.1) and sigma[0] == pytest.approx(0.8)
+    assert (px[0] == pytest.approx(at_start, abs=0.1) and abs(px[0]) == pytest.approx(abs(moved), abs=0.1)
+            and sigma[0] == pytest.approx(0.8))
 
 
 @pytest.mark.parametrize('presence', [bands(np.array([50.0]), 0.0, 0.02), bands(np.array([35.0, 48.0]), 15.0)])
@@ -94,6 +97,7 @@ def test_a_reconstruction_has_them_and_they_tell_a_shift_that_it_takes_up():
         assert result.confidence > 0.5 and {'tip', 'base'} <= set(result.landmarks.kinds)       # refused or not
         assert result.outcome is not Outcome.OK or np.nanmedian(result.shape.residuals_px) < 0.3
         lines = epipolar_lines(fundamental(A.P, wrong.P), result.landmarks.a_px)
-        found.append(dict(zip(result.landmarks.kinds, (lines[:, :2] * result.landmarks.b_px).sum(axis=1) + lines[:, 2])))
+        found.append(dict(zip(result.landmarks.kinds,
+                              (lines[:, :2] * result.landmarks.b_px).sum(axis=1) + lines[:, 2])))
     for end in ('tip', 'base'):
         assert abs(found[0][end]) < 0.4 and abs(found[1][end] - found[0][end]) == pytest.approx(1.0, abs=0.4)

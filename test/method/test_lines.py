@@ -92,12 +92,14 @@ def test_only_the_field_counts(faint):
     images, field = [drawn(*line, 6.0, k) for k, line in enumerate(LINES)], np.full((SIZE, SIZE), 255, np.uint8)
     half = field.copy()
     half[:, SIZE // 2:] = 0
-    for found, dark in zip(candidates(Sheet.of(images, [half, 0 * field], VIEWS), RADIUS, MIN_LENGTH, faint), (False, True)):
+    for found, dark in zip(candidates(Sheet.of(images, [half, 0 * field], VIEWS), RADIUS, MIN_LENGTH, faint),
+                           (False, True)):
         assert bool(found) != dark and all(c.points_px[:, 0].max() < SIZE // 2 + 1 for c in found)
 
 
 def test_a_line_of_the_devices_width_is_liked_better_than_a_wider_one():
-    image = 100 - 20 * np.sqrt(np.maximum(1 - ((V + 60) / 2) ** 2, 0)) - 30 * np.sqrt(np.maximum(1 - ((V - 50) / 7) ** 2, 0))
+    image = (100 - 20 * np.sqrt(np.maximum(1 - ((V + 60) / 2) ** 2, 0))
+             - 30 * np.sqrt(np.maximum(1 - ((V - 50) / 7) ** 2, 0)))
     noisy = (image + np.random.default_rng(0).normal(0, 0.5, V.shape)).astype(np.float32)
     for found in candidates(sheet(noisy, noisy), RADIUS, MIN_LENGTH, faint=False):
         assert abs(np.median(found[0].points_px[:, 1]) - (SIZE - 1) / 2 + 60) < 1
@@ -105,11 +107,13 @@ def test_a_line_of_the_devices_width_is_liked_better_than_a_wider_one():
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])
-@pytest.mark.parametrize('faint, share', [(False, 0.7), (True, 0.5)])      # an average along a line goes on past its end, and smooths bends
+# an average along a line goes on past its end, and smooths bends
+@pytest.mark.parametrize('faint, share', [(False, 0.7), (True, 0.5)])
 def test_the_device_is_among_the_best_candidates_of_either_image(seed, faint, share):
     scene = xray_run(seed, views=WIDE, lengths=(0.06, 0.08)).scene()
     images = scene.frame.images
-    for view, found in zip(WIDE, candidates(sheet_of(images, [field_of_view(i) for i in images], WIDE, 'dark'), RADIUS, MIN_LENGTH, faint)):
+    for view, found in zip(WIDE, candidates(sheet_of(images, [field_of_view(i) for i in images], WIDE, 'dark'), RADIUS,
+                                            MIN_LENGTH, faint)):
         assert 0 < len(found) <= CANDIDATES and all(0 < c.score <= 1 for c in found)
         true = cKDTree(project(view.P, scene.truth))
         assert max(np.mean(true.query(c.points_px)[0] < 2) for c in found) > share
@@ -127,7 +131,8 @@ def seen(points, view, score=0.9):
 
 def device(**shift):
     s = np.linspace(0, 1, 400)
-    return np.c_[0.012 * np.sin(2 * s) - 0.005, 0.01 * np.cos(2.5 * s), 0.06 * s - 0.03] + [shift.get(x, 0.0) for x in 'xyz']
+    return np.c_[0.012 * np.sin(2 * s) - 0.005, 0.01 * np.cos(2.5 * s), 0.06 * s - 0.03] + [shift.get(x, 0.0)
+                                                                                            for x in 'xyz']
 
 
 def test_lines_that_are_one_curve_come_first_and_say_where_it_is():
@@ -165,7 +170,8 @@ def test_lines_along_epipolar_lines_are_read_both_ways():
 
 def test_lines_are_undistorted_before_they_are_compared(monkeypatch):
     asked = []
-    monkeypatch.setattr('fluoro_shape_ros.method.propose.lines.undistort', lambda view, px: asked.append(view) or undistort(view, px))
+    monkeypatch.setattr('fluoro_shape_ros.method.propose.lines.undistort',
+                        lambda view, px: asked.append(view) or undistort(view, px))
     a, b = (seen(device(), v) for v in VIEWS)
     assert_array_equal(next(by_lines(VIEWS, ([a], [b]))).lines, (a, b))
     assert asked == list(VIEWS)

@@ -29,11 +29,13 @@ def test_what_stands_still_stays():
 
 
 def test_what_moves_evenly_goes_on():
-    assert np.allclose(going_on(replace(STILL, previous=lifted(straight(), 0.002)), 3 * STEP), lifted(straight(), 0.004).points, atol=1e-12)
+    assert np.allclose(going_on(replace(STILL, previous=lifted(straight(), 0.002)), 3 * STEP),
+                       lifted(straight(), 0.004).points, atol=1e-12)
 
 
 def test_after_a_missed_pair_it_is_twice_as_far():
-    assert np.allclose(going_on(replace(STILL, previous=lifted(straight(), 0.002)), 4 * STEP), lifted(straight(), 0.006).points, atol=1e-12)
+    assert np.allclose(going_on(replace(STILL, previous=lifted(straight(), 0.002)), 4 * STEP),
+                       lifted(straight(), 0.006).points, atol=1e-12)
 
 
 def test_an_inserted_device_grows_on_at_its_tip():
@@ -46,7 +48,8 @@ def test_an_inserted_device_grows_on_at_its_tip():
     replace(STILL, before_stamp_ns=2 * STEP), replace(STILL, before_stamp_ns=4 * STEP),         # no time, or backwards
     replace(STILL, before_stamp_ns=2 * STEP - 10**9),                                           # long ago
     replace(STILL, previous_stamp_ns=-STEP, before_stamp_ns=-2 * STEP),                         # several pairs missed
-    replace(STILL, previous_stamp_ns=3 * STEP), replace(STILL, previous_stamp_ns=5 * STEP),     # the stamps stand or jump back
+    # the stamps stand or jump back
+    replace(STILL, previous_stamp_ns=3 * STEP), replace(STILL, previous_stamp_ns=5 * STEP),
     replace(STILL, previous=lifted(straight(), 0.009)),                                         # faster than anything
 ], ids=range(10))
 def test_what_does_not_tell_a_velocity_expects_nothing(prior):

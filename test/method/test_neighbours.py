@@ -25,7 +25,8 @@ EXPOSURE = Exposure(photons=3000.0, contrast=0.35)
 
 
 def strips_with(*lines, offset_px=0.0, noise=0.0):
-    """Strips of one plane 17 px to either side of a device of depth 10 at `offset_px`, with `lines`: (offset in px, depth, half width in px)."""
+    """Strips of one plane 17 px to either side of a device of depth 10 at `offset_px`, with `lines`: (offset in px,
+    depth, half width in px)."""
     x = np.arange(-17.0, 18.0)
     profiles = np.tile(100 + 0.3 * x - 10 * shadow(HALF_WIDTH, x - offset_px), (len(ALL), 1))
     for at, depth, half_width in lines:
@@ -63,7 +64,8 @@ def test_a_darker_line_beside_the_device_no_longer_pulls_it(at, depth, half_widt
     assert_allclose(np.median(measured(clean).presence), 1, atol=0.05)
     assert alike(clean) > 0.97
     kept = np.abs(strips.offsets_px) <= REACH
-    plain = Strips(*(getattr(strips, n) for n in ('centers_px', 'normals', 'speed')), strips.profiles[..., kept], strips.offsets_px[kept], strips.inside, strips.lit)
+    plain = Strips(*(getattr(strips, n) for n in ('centers_px', 'normals', 'speed')), strips.profiles[..., kept],
+                   strips.offsets_px[kept], strips.inside, strips.lit)
     assert np.median(np.abs(measured(plain).offset_px[0] - 0.1)) > 0.15 or alike(plain) < 0.9      # that it is needed
 
 
@@ -98,14 +100,16 @@ def photographed(*lines):
     for k, view in enumerate(VIEWS):
         light = np.ones((400, 400), np.float32)
         for points, radius, contrast, shown in lines:
-            light = light * (transmission(points, radius, view, Exposure(photons=3000.0, contrast=contrast)) if shown[k] else 1.0)
+            light = light * (transmission(points, radius, view, Exposure(photons=3000.0, contrast=contrast))
+                             if shown[k] else 1.0)
         counts = np.random.default_rng(k).poisson(3000 * cv2.GaussianBlur(light, (0, 0), 0.8))
         images.append((counts / 3000 * 180).clip(0, 255).astype(np.uint8))
     return Frame(0, 'isocenter', tuple(images), VIEWS)
 
 
 def along_a_lead(px, contrast=0.6):
-    """A frame with a lead that runs `px` beside most of the device in plane A, darker than it, and leaves it on both sides."""
+    """A frame with a lead that runs `px` beside most of the device in plane A, darker than it, and leaves it on both
+    sides."""
     s = np.linspace(-0.4, 1.4, 800)
     points = np.stack([np.interp(s, np.linspace(0, 1, 400), c) for c in device().T], axis=1)
     step = (device()[-1] - device()[-2]) * 399, (device()[1] - device()[0]) * 399

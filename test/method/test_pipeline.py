@@ -26,7 +26,8 @@ SIZE = 512
 VIEWS = biplane(arm=CArm(pixel_size_iso=0.3e-3, width=SIZE, height=SIZE))
 RUN = dict(views=VIEWS, lengths=(0.06, 0.07))
 SAME = 0.02e-3          # m: what only the order of arithmetic may change
-ROUNDING = 0.03e-3     # 0.1 px: OpenCV 4 rounds the places that it samples to 1/32 px, otherwise for a fit that began elsewhere
+# 0.1 px: OpenCV 4 rounds the places that it samples to 1/32 px, otherwise for a fit that began elsewhere
+ROUNDING = 0.03e-3
 NOISE = 0.2e-3          # m: three standard deviations of an end, for what samples other pixels
 
 
@@ -56,15 +57,18 @@ def answer(scene, config):
 
 
 def test_what_a_fit_leaves_over_counts_like_a_calibration_error(scene):
-    sheet = Sheet.of([np.sqrt(i, dtype=np.float32) for i in scene.frame.images], [field_of_view(i) for i in scene.frame.images], VIEWS)
+    sheet = Sheet.of([np.sqrt(i, dtype=np.float32) for i in scene.frame.images],
+                     [field_of_view(i) for i in scene.frame.images], VIEWS)
     f = fit(sheet, scene.truth, scene.radius)
     even = replace(f, offset_px=np.zeros_like(f.offset_px))
     beside = replace(even, offset_px=even.offset_px + (f.s > f.stop - 20 * (f.s[1] - f.s[0]))[:, None] * [0.0, 0.8])
     plain, more = (backbone(x, VIEWS, True, 1e-3) for x in (even, beside))
     tangent = f.spline(np.array([f.stop]), 1)
-    assert_allclose((more.covariance - plain.covariance)[-1], calibration_covariance(VIEWS, plain.points[-1:], tangent, 0.8)[0], rtol=1e-6, atol=1e-16)
+    assert_allclose((more.covariance - plain.covariance)[-1],
+                    calibration_covariance(VIEWS, plain.points[-1:], tangent, 0.8)[0], rtol=1e-6, atol=1e-16)
     assert_allclose(more.covariance[0], plain.covariance[0])
-    alone = replace(even, offset_px=np.where(np.arange(len(f.s)) % 5 == 0, 2.0, 0.0)[:, None] * [1.0, 1.0])     # one strip in five is noise, or hidden
+    # one strip in five is noise, or hidden
+    alone = replace(even, offset_px=np.where(np.arange(len(f.s)) % 5 == 0, 2.0, 0.0)[:, None] * [1.0, 1.0])
     assert_allclose(backbone(alone, VIEWS, True, 1e-3).covariance, plain.covariance)
     unknown = replace(even, offset_px=np.full_like(f.offset_px, np.nan))
     assert_allclose(backbone(unknown, VIEWS, True, 1e-3).covariance, plain.covariance)
@@ -100,7 +104,8 @@ def test_equal_steps_and_the_tip_last(scene, config, answer):
         steps = np.diff(shape.s)
         assert_allclose(steps[:-1], step, rtol=1e-9)
         assert 0 < steps[-1] <= step * (1 + 1e-9) and shape.s[0] == 0
-        assert_allclose(np.linalg.norm(np.diff(shape.points, axis=0), axis=1), steps, rtol=2e-3)     # a chord is shorter than its arc
+        # a chord is shorter than its arc
+        assert_allclose(np.linalg.norm(np.diff(shape.points, axis=0), axis=1), steps, rtol=2e-3)
         assert_allclose(shape.tip, answer.shape.tip, atol=1e-6)
 
 
@@ -117,7 +122,8 @@ def test_what_comes_with_each_point(answer):
 
 def test_the_same_pair_gives_the_same_answer(scene, config, answer):
     again = reconstruct(scene.frame, config)
-    assert (again.shape.points == answer.shape.points).all() and (again.shape.covariance == answer.shape.covariance).all()
+    assert ((again.shape.points == answer.shape.points).all()
+            and (again.shape.covariance == answer.shape.covariance).all())
 
 
 @pytest.mark.parametrize('polarity', ['bright', 'auto'])
@@ -131,7 +137,8 @@ def test_auto_takes_a_dark_device_as_dark(scene, config, answer):
     assert_same(reconstruct(scene.frame, config.replace(polarity='auto')), answer)
 
 
-@pytest.mark.parametrize('change', [lambda i: i.astype(np.uint16) * 257, lambda i: i.astype('>u2') * 16, lambda i: i.astype(np.float32) / 255],
+@pytest.mark.parametrize('change', [lambda i: i.astype(np.uint16) * 257, lambda i: i.astype('>u2') * 16,
+                                    lambda i: i.astype(np.float32) / 255],
                          ids=['mono16', 'big endian', '32FC1'])
 def test_depth_and_range_of_the_image_do_not_matter(scene, config, answer, change):
     assert_same(reconstruct(mapped(scene.frame, change), config), answer)
@@ -140,22 +147,26 @@ def test_depth_and_range_of_the_image_do_not_matter(scene, config, answer, chang
 def shown(image, display):
     """The same X-rays on another display, 16 bits."""
     share = image / image.max()
-    return np.round({'gamma 0.5': share**0.5, 'gamma 2': share**2, 'logarithm': np.log1p(200 * share) / np.log(201)}[display] * 65535).astype(np.uint16)
+    return np.round({'gamma 0.5': share**0.5, 'gamma 2': share**2,
+                     'logarithm': np.log1p(200 * share) / np.log(201)}[display] * 65535).astype(np.uint16)
 
 
 @pytest.mark.parametrize('planes', [(0,), (1,), (0, 1)])
 @pytest.mark.parametrize('display', ['gamma 0.5', 'gamma 2', 'logarithm'])
 def test_what_a_display_does_to_the_counts_does_not_matter(scene, config, answer, display, planes):
-    frame = replace(scene.frame, images=tuple(shown(i, display) if k in planes else i for k, i in enumerate(scene.frame.images)))
+    frame = replace(scene.frame, images=tuple(shown(i, display) if k in planes else i
+                                              for k, i in enumerate(scene.frame.images)))
     other = reconstruct(frame, config)
     assert_allclose(other.confidence, answer.confidence, atol=0.01)
-    assert_allclose(other.shape.points[[0, -1]], answer.shape.points[[0, -1]], atol=NOISE)     # how opaque an end looks is not freed of the display yet
+    # how opaque an end looks is not freed of the display yet
+    assert_allclose(other.shape.points[[0, -1]], answer.shape.points[[0, -1]], atol=NOISE)
     assert cKDTree(answer.shape.points).query(other.shape.points[1:-1])[0].max() < 0.03e-3       # 0.1 px
 
 
 def test_a_float_image_may_be_negative(scene, config, answer):
     shifted = mapped(scene.frame, lambda i: i.astype(np.float32) - 300)
-    assert_same(reconstruct(shifted, config), answer, within=0.05e-3, ends=0.7e-3)   # without a true zero the darkness of the device is not known
+    # without a true zero the darkness of the device is not known
+    assert_same(reconstruct(shifted, config), answer, within=0.05e-3, ends=0.7e-3)
 
 
 def test_swapped_planes_give_the_same_curve(scene, config, answer):
@@ -167,7 +178,8 @@ def test_swapped_planes_give_the_same_curve(scene, config, answer):
 def test_a_mirrored_plane_gives_the_same_curve(scene, config, answer):
     a, b = scene.frame.views
     flip = np.array([[-1, 0, SIZE - 1], [0, 1, 0], [0, 0, 1.0]])
-    mirrored = replace(scene.frame, images=(scene.frame.images[0][:, ::-1].copy(), scene.frame.images[1]), views=(replace(a, P=flip @ a.P), b))
+    mirrored = replace(scene.frame, images=(scene.frame.images[0][:, ::-1].copy(), scene.frame.images[1]),
+                       views=(replace(a, P=flip @ a.P), b))
     assert_same(reconstruct(mirrored, config), answer, ends=NOISE)
 
 
@@ -187,7 +199,8 @@ def distorted(scene):
     views, images = [], []
     for view, image in zip(scene.frame.views, scene.frame.images):
         K, _, _ = decompose(view.P)
-        view = replace(view, distortion=Distortion('plumb_bob', K + [[0, 0, 2.0], [0, 0, -3.0], [0, 0, 0]], tilted, np.eye(3)))
+        view = replace(view, distortion=Distortion('plumb_bob', K + [[0, 0, 2.0], [0, 0, -3.0], [0, 0, 0]], tilted,
+                                                   np.eye(3)))
         coarse = np.arange(0, SIZE + 8.0, 8)
         uv = np.stack(np.meshgrid(coarse, coarse), axis=-1)
         ideal = undistort(view, uv.reshape(-1, 2)).reshape(uv.shape).astype(np.float32)
@@ -209,7 +222,8 @@ def test_a_pair_without_device_is_rejected(blank, config):
     assert reconstruct(blank, config).outcome in (Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B)
 
 
-@pytest.mark.parametrize('value, dtype', [(0, np.uint8), (3, np.uint8), (128, np.uint8), (255, np.uint8), (40000, np.uint16), (0.7, np.float32)])
+@pytest.mark.parametrize('value, dtype', [(0, np.uint8), (3, np.uint8), (128, np.uint8), (255, np.uint8),
+                                          (40000, np.uint16), (0.7, np.float32)])
 @pytest.mark.parametrize('shape', [(512, 512), (300, 300)])
 def test_an_even_pair_is_no_device(config, shape, value, dtype):
     views = biplane(arm=CArm(width=shape[1], height=shape[0]))
@@ -231,7 +245,8 @@ def test_a_device_in_one_plane_only_is_rejected(plane, seed, anatomy):
 
 def test_planes_of_different_moments_are_rejected(scene, config):
     other = xray_run(7, anatomy=False, **RUN).scene()
-    assert reconstruct(replace(scene.frame, images=(scene.frame.images[0], other.frame.images[1])), config).outcome is not Outcome.OK
+    assert (reconstruct(replace(scene.frame, images=(scene.frame.images[0], other.frame.images[1])), config).outcome
+            is not Outcome.OK)
 
 
 def test_parallel_planes_are_no_geometry(scene, config):
@@ -243,9 +258,11 @@ def test_parallel_planes_are_no_geometry(scene, config):
 def test_a_rectified_stereo_pair_in_the_frame_of_plane_a(method):
     K, R, t = decompose(VIEWS[0].P)
     baseline = 0.06
-    views = tuple(make_view(name, K @ np.c_[R, t + [x, 0, 0]], SIZE, SIZE) for name, x in (('a', baseline / 2), ('b', -baseline / 2)))
+    views = tuple(make_view(name, K @ np.c_[R, t + [x, 0, 0]], SIZE, SIZE)
+                  for name, x in (('a', baseline / 2), ('b', -baseline / 2)))
     seen = xray_run(0, anatomy=False, **RUN | dict(views=views)).scene()
-    rectified = tuple(make_view(name, K @ np.c_[np.eye(3), [x, 0, 0]], SIZE, SIZE) for name, x in (('a', 0), ('b', -baseline)))
+    rectified = tuple(make_view(name, K @ np.c_[np.eye(3), [x, 0, 0]], SIZE, SIZE)
+                      for name, x in (('a', 0), ('b', -baseline)))
     result = reconstruct(replace(seen.frame, views=rectified), Config.from_values(method=method))
     assert result.outcome is Outcome.OK
     truth = seen.truth @ R.T + t + [baseline / 2, 0, 0]
@@ -315,7 +332,8 @@ def test_tracking_follows_a_device_that_has_drawn_back(run, config):
     before = reconstruct(long.frame, config)
     result = reconstruct(short.frame, config, Prior(previous=before.shape))
     assert result.outcome is Outcome.OK
-    assert np.linalg.norm(result.shape.tip - short.truth[-1]) < 0.2e-3 and off(result.shape.points, short.truth).mean() < 0.05e-3
+    assert (np.linalg.norm(result.shape.tip - short.truth[-1]) < 0.2e-3
+            and off(result.shape.points, short.truth).mean() < 0.05e-3)
 
 
 @pytest.mark.parametrize('away', [(0.012, 0, 0), (0.0, 0.0, 0.03), (0.1, 0.1, 0.1)])
@@ -357,9 +375,11 @@ def test_confidence_is_a_probability_that_decides_and_changes_nothing(scene, con
 @pytest.mark.parametrize('wider', [0.5, 1.9])
 def test_a_robot_radius_that_is_far_off_is_borne_or_named(seed, contrast, wider):
     scene = xray_run(seed, anatomy=False, exposure=Exposure(contrast=contrast), **RUN).scene()
-    result = reconstruct(scene.frame, Config.from_values(robot_radius=scene.radius / wider, base_position=scene.base_position.tolist()))
+    result = reconstruct(scene.frame, Config.from_values(robot_radius=scene.radius / wider,
+                                                         base_position=scene.base_position.tolist()))
     if result.outcome is Outcome.OK:
-        assert off(result.shape.points, scene.truth).mean() < 0.05e-3 and np.linalg.norm(result.shape.tip - scene.truth[-1]) < 1e-3
+        assert (off(result.shape.points, scene.truth).mean() < 0.05e-3
+                and np.linalg.norm(result.shape.tip - scene.truth[-1]) < 1e-3)
     else:
         assert result.outcome is Outcome.LOW_CONFIDENCE and result.detail
 
@@ -369,15 +389,18 @@ PAST, NEVER = 0.0, 1e12     # time.monotonic(): time is up from the beginning, o
 
 def test_a_search_that_is_cut_short_is_out_of_time(scene, config):
     result = reconstruct(scene.frame, config, until=PAST)
-    assert result.outcome is Outcome.OUT_OF_TIME and result.detail == 'no curve was found by then' and result.shape is None
+    assert (result.outcome is Outcome.OUT_OF_TIME and result.detail == 'no curve was found by then'
+            and result.shape is None)
 
 
 def test_what_was_found_by_then_is_judged(scene, config, answer):
     prior = Prior(previous=answer.shape)
     result = reconstruct(scene.frame, config.replace(min_confidence=1.0), prior, PAST)
-    assert result.outcome is Outcome.OUT_OF_TIME and 'by then: ' in result.detail and 0.5 < result.confidence < 1 and None not in result.centerlines
+    assert (result.outcome is Outcome.OUT_OF_TIME and 'by then: ' in result.detail and 0.5 < result.confidence < 1
+            and None not in result.centerlines)
     assert_same(reconstruct(scene.frame, config.replace(min_confidence=0.5), prior, PAST), answer, ends=ROUNDING)
-    assert reconstruct(scene.frame, config.replace(expected_length=(0.1, 0.2)), prior, PAST).outcome is Outcome.LENGTH      # no more time would have helped
+    # no more time would have helped
+    assert reconstruct(scene.frame, config.replace(expected_length=(0.1, 0.2)), prior, PAST).outcome is Outcome.LENGTH
 
 
 def test_a_search_that_is_cut_short_goes_on_with_the_next_pair(scene, config, answer):
@@ -393,7 +416,8 @@ def test_a_search_that_is_cut_short_goes_on_with_the_next_pair(scene, config, an
 def test_the_device_is_looked_for_where_it_was_however_late_it_is(scene, config, answer):
     prior = Prior(previous=answer.shape)
     given = reconstruct(scene.frame, config, prior, PAST)
-    assert given.outcome is Outcome.OK and (given.shape.points == reconstruct(scene.frame, config, prior).shape.points).all()
+    assert (given.outcome is Outcome.OK
+            and (given.shape.points == reconstruct(scene.frame, config, prior).shape.points).all())
 
 
 def test_a_search_that_ends_in_time_is_as_without_a_limit(scene, blank, config, answer):
@@ -404,9 +428,11 @@ def test_a_search_that_ends_in_time_is_as_without_a_limit(scene, blank, config, 
 
 def test_the_published_method_has_no_limit(scene, config):
     given = config.replace(method='paper')
-    assert reconstruct(scene.frame, given, until=PAST).outcome is reconstruct(scene.frame, given).outcome is not Outcome.OUT_OF_TIME
+    assert (reconstruct(scene.frame, given, until=PAST).outcome is reconstruct(scene.frame, given).outcome
+            is not Outcome.OUT_OF_TIME)
 
 
 def test_limits_that_are_kept_reject_nothing(scene, config, answer):
-    kept = config.replace(max_tip_sigma=0.001, expected_length=(0.05, 0.08), max_curvature=60.0, min_length_px=150.0, max_reprojection_px=0.5)
+    kept = config.replace(max_tip_sigma=0.001, expected_length=(0.05, 0.08), max_curvature=60.0, min_length_px=150.0,
+                          max_reprojection_px=0.5)
     assert_same(reconstruct(scene.frame, kept), answer)

@@ -84,12 +84,15 @@ def test_doubt_by_hand(found, why):
 
 def test_a_prediction_of_either_direction_is_borne_out_by_its_curve():
     guess, _ = look(LINE)
-    assert prior.borne_out(LINE, guess) and prior.borne_out(LINE[::-1], guess) and not prior.borne_out(LINE + [0, 0.02, 0], guess)
-    assert prior.whole(0.1, guess, VIEWS) and not prior.whole(0.06, guess, VIEWS) and not prior.whole(0.14, guess, VIEWS)
+    assert (prior.borne_out(LINE, guess) and prior.borne_out(LINE[::-1], guess)
+            and not prior.borne_out(LINE + [0, 0.02, 0], guess))
+    assert (prior.whole(0.1, guess, VIEWS) and not prior.whole(0.06, guess, VIEWS)
+            and not prior.whole(0.14, guess, VIEWS))
 
 
 def test_in_a_fit_it_counts_by_its_standard_deviation_and_only_across_the_curve():
-    # along x; the images know z to 0.01 mm, but y, the same all along, only to 5 mm. Five independent points say y = 2 mm, z = 2 mm, each to 5 mm
+    # along x; the images know z to 0.01 mm, but y, the same all along, only to 5 mm. Five independent points say y = 2
+    # mm, z = 2 mm, each to 5 mm
     n, mm = 9, 1e-3
     control = np.c_[np.linspace(-0.05 - 0.1 / 6, 0.05 + 0.1 / 6, n), np.zeros((n, 2))]
     covariance = np.zeros((n, 3, n, 3))
@@ -99,7 +102,8 @@ def test_in_a_fit_it_counts_by_its_standard_deviation_and_only_across_the_curve(
     told = prior.informed(f, prior.Guess(LINE + [0.3 * mm, 2 * mm, 2 * mm], np.full(len(LINE), 5 * mm)))
     points = told.spline(np.linspace(0, 0.1, 21))
     assert_allclose(points[:, 0], np.linspace(-0.05, 0.05, 21), atol=1e-6)      # it does not slide along itself
-    assert_allclose(points[:, 1], 2 * mm * 5 / 6, atol=1e-6)                    # 5 / 25 of the points against 1 / 25 of the images
+    # 5 / 25 of the points against 1 / 25 of the images
+    assert_allclose(points[:, 1], 2 * mm * 5 / 6, atol=1e-6)
     assert_allclose(points[:, 2], 0, atol=1e-6)
     assert_allclose(np.sqrt(told.covariance.reshape(n, 3, n, 3)[4, 1, 4, 1]), 5 * mm / np.sqrt(6), rtol=1e-3)
 
@@ -154,7 +158,8 @@ def test_a_pushed_robot_is_measured_where_it_is_without_a_search(scene, config, 
     result = reconstruct(scene.frame, config, Prior(predicted=good))
     assert result.prediction == 'agrees' and not result.warnings
     assert 'follow' in result.stage_seconds and 'search' not in result.stage_seconds
-    assert np.linalg.norm(result.shape.tip - scene.truth[-1]) < 0.2e-3 < 0.01 < np.linalg.norm(good[-1] - scene.truth[-1])
+    assert (np.linalg.norm(result.shape.tip - scene.truth[-1]) < 0.2e-3 < 0.01
+            < np.linalg.norm(good[-1] - scene.truth[-1]))
 
 
 def test_tracking_that_the_prediction_contradicts_gives_way_to_it(scene, config, answer, good, monkeypatch):
@@ -208,7 +213,8 @@ def test_without_a_device_nothing_is_found_where_it_is_predicted(config, good):
 
 
 @pytest.mark.parametrize('family, seed', [
-    ('tangent', 10035),     # one step past the device's bend the curve leaves it in both planes at once, which looks like an end, 20 mm short of it
+    ('tangent', 10035),     # one step past the device's bend the curve leaves it in both planes at once, which looks
+                            # like an end, 20 mm short of it
     ('clutter', 20037),     # the planes' views of an end move the curve by 4 px, after strips were last laid across it
     ('tangent', 10007),     # the same, in depth
 ])
@@ -228,12 +234,14 @@ def faint():
 def test_a_prediction_that_is_borne_out_speaks_for_a_faint_device_and_a_wrong_one_says_nothing(faint):
     given = predictions(faint.truth, 1)
     config = Config.from_values(base_position=faint.base_position.tolist())
-    ask = lambda least, **kind: reconstruct(faint.frame, config.replace(min_confidence=least), Prior(**kind))     # noqa: E731
+    ask = lambda least, **kind: reconstruct(faint.frame, config.replace(min_confidence=least),    # noqa: E731
+                                            Prior(**kind))
     without, known = ask(0.0), ask(0.0, predicted=given['good'])
     assert np.linalg.norm(known.shape.tip - faint.truth[-1]) < 1e-3 and known.prediction == 'agrees'
     assert known.confidence > without.confidence
     between = (known.confidence + without.confidence) / 2
-    assert ask(between).outcome is Outcome.LOW_CONFIDENCE and ask(between, predicted=given['good']).outcome is Outcome.OK
+    assert (ask(between).outcome is Outcome.LOW_CONFIDENCE
+            and ask(between, predicted=given['good']).outcome is Outcome.OK)
     for kind in ('shifted', 'reversed', 'another'):
         wrong = ask(between, predicted=given[kind])
         assert wrong.outcome is Outcome.LOW_CONFIDENCE and wrong.prediction == 'not compared'

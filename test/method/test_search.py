@@ -62,7 +62,9 @@ def sized_up(sheet):
 
 def searched(sheet, guess=None, leads=(), late=never_late, **other):
     """What was tried, and the lines."""
-    found = Search(sheet, RADIUS, MIN_LENGTH, **dict(judge=sized_up(sheet), settles=lambda odds: judge.load().settles(odds, LEAST)) | other, guess=guess, leads=leads)
+    found = Search(sheet, RADIUS, MIN_LENGTH,
+                   **dict(judge=sized_up(sheet), settles=lambda odds: judge.load().settles(odds, LEAST)) | other,
+                   guess=guess, leads=leads)
     found.go_on(late)
     return found.tried, found.lines
 
@@ -108,7 +110,8 @@ def of(odds, points=LINE):
 
 
 @pytest.mark.parametrize('other, expected', [
-    (LINE, False), (LINE + [1.9 * MEAN, 0, 0], False), (LINE + [2.1 * MEAN, 0, 0], True), (LINE[::-1], True),       # the other way round
+    # the other way round
+    (LINE, False), (LINE + [1.9 * MEAN, 0, 0], False), (LINE + [2.1 * MEAN, 0, 0], True), (LINE[::-1], True),
     (LINE[10:], False),                                                             # another base is no other answer
     (LINE[LINE[:, 2] < 0.05 - 1.4 * TIP], False), (LINE[LINE[:, 2] < 0.05 - 2.6 * TIP], True)])
 def test_which_curves_exclude_one_another(other, expected):
@@ -145,12 +148,15 @@ def test_odds_beyond_all_measure_are_still_odds():
 
 
 def counted(monkeypatch, hypotheses, faint=()):
-    """Replace what is tried by `hypotheses`, and by `faint` ones; what is returned lists the curves that are fitted, and whether faint lines were asked for."""
+    """Replace what is tried by `hypotheses`, and by `faint` ones; what is returned lists the curves that are fitted,
+    and whether faint lines were asked for."""
     asked, fitted, real = [], [], search.fit
-    monkeypatch.setattr(search, 'candidates', lambda sheet, radius, min_length_px, faint: asked.append(faint) or ([], []))
+    monkeypatch.setattr(search, 'candidates',
+                        lambda sheet, radius, min_length_px, faint: asked.append(faint) or ([], []))
     monkeypatch.setattr(search, 'by_lines', lambda *_: iter(faint if asked[-1] else hypotheses))
     monkeypatch.setattr(search, '_again', lambda *_: iter(()))
-    monkeypatch.setattr(search, 'fit', lambda sheet, points, *rest, **options: fitted.append(points) or real(sheet, points, *rest, **options))
+    monkeypatch.setattr(search, 'fit', lambda sheet, points, *rest, **options: fitted.append(points)
+                                                                               or real(sheet, points, *rest, **options))
     return fitted, asked
 
 
@@ -164,9 +170,11 @@ def seen_along(line):
     return Candidate(line, np.ones(len(line)), 0.9)
 
 
-def test_what_is_beyond_doubt_ends_the_search_but_for_the_same_lines_read_the_other_way_round(scene, sheet, monkeypatch):
+def test_what_is_beyond_doubt_ends_the_search_but_for_the_same_lines_read_the_other_way_round(scene, sheet,
+                                                                                              monkeypatch):
     same, other = lines(scene.truth), lines(scene.truth)
-    hypotheses = [Hypothesis(scene.truth, same), Hypothesis(scene.truth[::-1], same), Hypothesis(scene.truth, other), Hypothesis(scene.truth, same)]
+    hypotheses = [Hypothesis(scene.truth, same), Hypothesis(scene.truth[::-1], same), Hypothesis(scene.truth, other),
+                  Hypothesis(scene.truth, same)]
     fitted, asked = counted(monkeypatch, hypotheses)
     tried, _ = searched(sheet, settles=always)
     assert len(tried) == len(fitted) == 2 and asked == [False]
@@ -203,18 +211,22 @@ def test_a_lead_in_doubt_competes_with_what_is_found(chosen, sheet):
 
 
 def late_from(ask):
-    """A clock that says that time is up when it is asked for the `ask`-th time, and from then on; and the list of its answers."""
+    """A clock that says that time is up when it is asked for the `ask`-th time, and from then on; and the list of its
+    answers."""
     asked = []
     return lambda: asked.append(len(asked) + 1 >= ask) or asked[-1], asked
 
 
-@pytest.mark.parametrize('ask, fits, looked', [(1, 0, []), (2, 0, [False]), (3, 1, [False]), (4, 2, [False]), (5, 2, [False, True]), (6, 3, [False, True])])
+@pytest.mark.parametrize('ask, fits, looked', [(1, 0, []), (2, 0, [False]), (3, 1, [False]), (4, 2, [False]),
+                                               (5, 2, [False, True]), (6, 3, [False, True])])
 def test_when_time_is_up_nothing_else_is_begun(scene, sheet, monkeypatch, ask, fits, looked):
-    """Asked before the plain lines, before the fit of each, before the faint lines, before the fit of each, and before all else."""
+    """Asked before the plain lines, before the fit of each, before the faint lines, before the fit of each, and before
+    all else."""
     plain, faint = ([Hypothesis(scene.truth, lines(scene.truth)) for _ in range(n)] for n in (2, 1))
     fitted, asked = counted(monkeypatch, plain, faint)
     late, said = late_from(ask)
-    tried, _ = searched(sheet, settles=never, late=late, judge=lambda _: (np.zeros(0), search.HOPELESS - 1, True))     # none is fitted twice
+    # none is fitted twice
+    tried, _ = searched(sheet, settles=never, late=late, judge=lambda _: (np.zeros(0), search.HOPELESS - 1, True))
     assert (len(fitted), asked) == (fits, looked) and len(tried) == fits and said.index(True) == ask - 1
 
 
@@ -279,9 +291,11 @@ def test_what_is_shorter_than_asked_for_is_not_tried(chosen, sheet, monkeypatch)
 
 def test_a_fit_that_still_moves_is_fitted_once_more(chosen, sheet, monkeypatch):
     again = []
-    monkeypatch.setattr(search, 'fit', lambda sheet, points, radius, coarse, **options: again.append((coarse, options)) or chosen.fit)
+    monkeypatch.setattr(search, 'fit',
+                        lambda sheet, points, radius, coarse, **options: again.append((coarse, options)) or chosen.fit)
     resting, moving = (replace(chosen.fit, moved_px=by * RESTLESS_PX) for by in (0.9, 1.1))
-    assert at_rest(sheet, resting, RADIUS, clearing=True) is resting and at_rest(sheet, None, RADIUS) is None and not again
+    assert (at_rest(sheet, resting, RADIUS, clearing=True) is resting
+            and at_rest(sheet, None, RADIUS) is None and not again)
     assert at_rest(sheet, moving, RADIUS, clearing=True) is chosen.fit and again == [(0, dict(clearing=True))]
 
 
@@ -303,7 +317,8 @@ def test_what_was_seen_lies_on_the_device(scene, sheet, chosen):
 def test_without_a_device_the_plane_is_named():
     plain = xray_run(1, views=VIEWS, lengths=(0.06, 0.08), anatomy=False)
     there, gone = plain.scene().frame, plain.without_device()
-    for images, outcome in (((gone.images[0], there.images[1]), Outcome.NO_DEVICE_A), ((there.images[0], gone.images[1]), Outcome.NO_DEVICE_B),
+    for images, outcome in (((gone.images[0], there.images[1]), Outcome.NO_DEVICE_A),
+                            ((there.images[0], gone.images[1]), Outcome.NO_DEVICE_B),
                             (gone.images, Outcome.NO_DEVICE_A)):
         frame = replace(there, images=images)
         tried, seen = searched(prepared(frame))
@@ -318,7 +333,8 @@ def test_lines_that_share_no_epipolar_lines_do_not_correspond():
     rolled = np.roll(plain.images[1], 230, axis=0)      # the device stands nearly half the image lower there
     frame = replace(plain, images=(plain.images[0], rolled))
     result = reconstruct(frame, Config.from_values(robot_radius=RADIUS))
-    assert result.outcome in (Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE, Outcome.REPROJECTION) and not result.confidence > 0.5
+    assert (result.outcome in (Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE, Outcome.REPROJECTION)
+            and not result.confidence > 0.5)
 
 
 def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, sheet, monkeypatch):
@@ -326,7 +342,8 @@ def test_a_line_that_is_half_another_in_one_plane_is_looked_for_anew(scene, shee
     a, b = (project(v.P, scene.truth) for v in VIEWS)
     half = len(b) // 2
     step = b[half] - b[half - 1]
-    b = np.concatenate([b[:half], b[half] + np.arange(len(b) - half)[:, None] * (step + np.linalg.norm(step) * np.array([0.5, 0]))])
+    b = np.concatenate([b[:half], b[half] + np.arange(len(b) - half)[:, None]
+                                  * (step + np.linalg.norm(step) * np.array([0.5, 0]))])
     monkeypatch.setattr(search, 'candidates', lambda *_: ([seen_along(a)], [seen_along(b)]))
     tried, seen = searched(sheet, settles=never)
     assert is_right(choose(tried)[0].fit, scene.truth)
@@ -339,7 +356,8 @@ def test_lines_along_epipolar_lines_fit_both_ways_round_and_both_count(seed):
     truth = scene.truth
     answer = reconstruct(scene.frame, Config.from_values(robot_radius=scene.radius, base_position=truth[0].tolist()))
     if answer.outcome is Outcome.OK:
-        off = cKDTree(truth).query(answer.shape.points)[0]      # the wrong way round is some mm off; the base, along the epipolar line, is known to 1 mm only
+        # the wrong way round is some mm off; the base, along the epipolar line, is known to 1 mm only
+        off = cKDTree(truth).query(answer.shape.points)[0]
         assert off.mean() < 0.1e-3 and off[-20:].max() < 0.5e-3 and off.max() < 1e-3
     else:
         assert answer.outcome is Outcome.LOW_CONFIDENCE and answer.confidence < Config().plausibility.min_confidence
@@ -359,7 +377,8 @@ def track(frame, points):
 def test_tracking_goes_on_from_where_the_device_was(scene, chosen):
     found = track(scene.frame, scene.truth + [0.3e-3, -0.3e-3, 0.3e-3])
     assert found.alone and is_right(found.fit, scene.truth) and mean_off(found.fit, chosen.fit.curve(300)) < RIGHT_END
-    assert all(p.size < i.size for p, i in zip(found.sheet.planes, scene.frame.images))       # it looked at no more than a region
+    # it looked at no more than a region
+    assert all(p.size < i.size for p, i in zip(found.sheet.planes, scene.frame.images))
 
 
 def test_what_is_tracked_where_the_device_is_not_asks_for_a_search(scene):

@@ -41,7 +41,8 @@ def thickness(image):
 
 @cache
 def drawn(seed):
-    """The true backbone of a device whose base is outside, or inside where the seed is odd, and what part of each pixel's ray it takes, as a share of its diameter."""
+    """The true backbone of a device whose base is outside, or inside where the seed is odd, and what part of each
+    pixel's ray it takes, as a share of its diameter."""
     rng = np.random.default_rng(seed)
     fields = tuple(map(placement.Field, VIEWS))
     shape, shaft = placement.place(rng, fields, 'spline', (0.05, 0.09), entering=seed % 2 == 0)
@@ -70,7 +71,8 @@ def rough(mask, rng):
 
 
 def answer(truth, masks, radius=RADIUS, prior=Prior(), **parameters):    # noqa: B008 (never changed)
-    config = Config.from_values(image_kind='silhouette', robot_radius=radius, base_position=tuple(truth[0]), **parameters)
+    config = Config.from_values(image_kind='silhouette', robot_radius=radius, base_position=tuple(truth[0]),
+                                **parameters)
     return reconstruct(Frame(0, 'here', tuple(masks), VIEWS), config, prior)
 
 
@@ -80,8 +82,10 @@ def along(result, truth):
     return float((result.shape.tip - truth[-1]) @ direction / np.linalg.norm(direction))
 
 
-@pytest.mark.parametrize('of', [lambda m, rng: m, lambda m, rng: 255 * m, lambda m, rng: m * rng.integers(1, 256, m.shape).astype(np.uint8),
-                                lambda m, rng: m * rng.integers(1, 2**16, m.shape).astype(np.uint16), lambda m, rng: m.astype(np.float32)])
+@pytest.mark.parametrize('of', [lambda m, rng: m, lambda m, rng: 255 * m,
+                                lambda m, rng: m * rng.integers(1, 256, m.shape).astype(np.uint8),
+                                lambda m, rng: m * rng.integers(1, 2**16, m.shape).astype(np.uint16),
+                                lambda m, rng: m.astype(np.float32)])
 def test_all_but_zero_is_device(of):
     mask = band(6)
     assert np.array_equal(outline(of(mask, np.random.default_rng(1)), 6.0), mask)
@@ -102,7 +106,8 @@ def test_small_holes_are_closed_and_small_islands_are_gone():
 @pytest.mark.parametrize('quality', [60, 95])
 def test_what_jpeg_leaves_of_a_silhouette(quality):
     mask = outline(silhouettes(1)[1][0], 3.0)
-    received = cv2.imdecode(cv2.imencode('.jpg', 255 * mask, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_UNCHANGED)
+    received = cv2.imdecode(cv2.imencode('.jpg', 255 * mask, [cv2.IMWRITE_JPEG_QUALITY, quality])[1],
+                            cv2.IMREAD_UNCHANGED)
     assert np.count_nonzero(received) > 1.3 * np.count_nonzero(mask)        # it rings
     assert np.count_nonzero(outline(received, 3.0) != mask) < 0.03 * np.count_nonzero(mask)
 
@@ -116,13 +121,16 @@ def test_the_shadow_is_as_thick_as_the_device_however_thick_the_outline(half_wid
 
 
 def test_the_ends_of_outlines():
-    """A flat end is a step; that of which the rim is seen goes on as an ellipse, whose area is that of pi / 4 of its length."""
+    """A flat end is a step; that of which the rim is seen goes on as an ellipse, whose area is that of pi / 4 of its
+    length."""
     at = lambda shape: (np.arange(len(shape)) - len(shape) // 2) * FINE_PX     # noqa: E731
     flat, half_circle, corners = (_end_of(10.0, *shape) for shape in ((0.0, 0.0), (10.0, 0.0), (0.0, 4.0)))
     assert np.interp([-3, 0, 3], at(flat), flat) == pytest.approx([1.0, 0.5, 0.0], abs=0.1)
-    assert np.interp([0, 5, 8, 11], at(half_circle), half_circle) == pytest.approx([1.0, np.sqrt(0.75), 0.6, 0.0], abs=0.05)
+    assert (np.interp([0, 5, 8, 11], at(half_circle), half_circle)
+            == pytest.approx([1.0, np.sqrt(0.75), 0.6, 0.0], abs=0.05))
     assert half_circle[at(half_circle) >= 0].sum() * FINE_PX == pytest.approx(10 * np.pi / 4, abs=0.2)
-    assert np.interp([0, 2, 2.5, 5.5], at(corners), corners) == pytest.approx([1.0, (6 + np.sqrt(12)) / 10, (6 + np.sqrt(9.75)) / 10, 0.0], abs=0.03)
+    assert (np.interp([0, 2, 2.5, 5.5], at(corners), corners)
+            == pytest.approx([1.0, (6 + np.sqrt(12)) / 10, (6 + np.sqrt(9.75)) / 10, 0.0], abs=0.03))
 
 
 @pytest.mark.parametrize('thicker_px', [-1, 0, 2])
@@ -131,7 +139,8 @@ def test_clean_outlines(thicker_px):
     for seed in (1, 2, 3):
         truth, masks = silhouettes(seed, thicker_px, jagged=False)
         result = answer(truth, masks)
-        assert result.outcome is Outcome.OK and compare(result.shape.points, truth).mean < 0.06e-3 and abs(along(result, truth)) < 0.5e-3
+        assert (result.outcome is Outcome.OK and compare(result.shape.points, truth).mean < 0.06e-3
+                and abs(along(result, truth)) < 0.5e-3)
 
 
 def test_rough_outlines_and_what_the_covariance_says_of_them():
@@ -153,21 +162,24 @@ def test_jagged_outlines_are_known_less_well():
         covariance = answer(*silhouettes(seed, jagged=jagged), min_confidence=0.0).shape.covariance
         return np.trace(covariance[len(covariance) // 2])
 
-    assert sum(variance(seed, True) for seed in (1, 2, 3, 4)) > 1.1 * sum(variance(seed, False) for seed in (1, 2, 3, 4))
+    assert sum(variance(seed, True) for seed in (1, 2, 3, 4)) > 1.1 * sum(variance(seed, False)
+                                                                          for seed in (1, 2, 3, 4))
 
 
 @pytest.mark.parametrize('share', [0.75, 1.25])
 def test_a_radius_that_is_off_by_a_quarter(share):
     truth, masks = silhouettes(3)
     result = answer(truth, masks, share * RADIUS)
-    assert result.outcome is Outcome.OK and compare(result.shape.points, truth).mean < 0.2e-3 and abs(along(result, truth)) < 0.8e-3
+    assert (result.outcome is Outcome.OK and compare(result.shape.points, truth).mean < 0.2e-3
+            and abs(along(result, truth)) < 0.8e-3)
 
 
 def test_a_line_drawn_with_a_round_brush_ends_where_the_brush_stopped():
     """20 px wide: the outline goes on for 10 px, 4 mm, past both ends."""
     truth, _ = drawn(3)
     lines = [np.round(16 * project(v.P, truth)).astype(np.int32) for v in VIEWS]
-    masks = [cv2.polylines(np.zeros((v.height, v.width), np.uint8), [line], False, 255, 21, cv2.LINE_8, 4) for v, line in zip(VIEWS, lines)]
+    masks = [cv2.polylines(np.zeros((v.height, v.width), np.uint8), [line], False, 255, 21, cv2.LINE_8, 4)
+             for v, line in zip(VIEWS, lines)]
     result = answer(truth, masks, 10 / pixels_per_metre(VIEWS[0].P, truth))
     assert result.outcome is Outcome.OK and compare(result.shape.points, truth).mean < 0.1e-3
     assert abs(along(result, truth)) < 0.6e-3 and np.linalg.norm(result.shape.points[0] - truth[0]) < 0.8e-3
@@ -178,7 +190,8 @@ def test_levels_polarity_and_a_mask_image_change_nothing():
     first = answer(truth, masks)
     seen = [255 - m for m in masks]
     for other in (answer(truth, [m // 255 for m in masks]), answer(truth, [257 * m.astype(np.uint16) for m in masks]),
-                  answer(truth, masks, polarity='bright'), answer(truth, masks, prior=Prior(masks=tuple(m.astype(np.float32) for m in seen)))):
+                  answer(truth, masks, polarity='bright'),
+                  answer(truth, masks, prior=Prior(masks=tuple(m.astype(np.float32) for m in seen)))):
         assert np.array_equal(other.shape.points, first.shape.points) and other.confidence == first.confidence
 
 
@@ -213,8 +226,10 @@ def test_the_node_answers_as_the_replay_does_and_changes_its_mind_at_run_time(tm
     masks = [(pixels < 140).astype(np.uint8) for pixels in ros.GOOD]
     record(tmp_path / 'run', [masks])
     given = 'image_kind:=silhouette', 'tracking:=false', ros.BASE, ros.RADIUS
-    replay = [sys.executable, '-m', 'fluoro_shape_ros.files.replay', 'run', '--out', 'out', *(word for p in given for word in ('-p', p))]
-    assert subprocess.run(replay, cwd=tmp_path, env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, timeout=60).returncode == 0
+    replay = [sys.executable, '-m', 'fluoro_shape_ros.files.replay', 'run', '--out', 'out',
+              *(word for p in given for word in ('-p', p))]
+    assert subprocess.run(replay, cwd=tmp_path, env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+                          timeout=60).returncode == 0
     (_, offline), = read(tmp_path / 'out')['/backbone']
     for transport in ('raw', 'compressed'):
         start = *given, f'image_transport:={transport}', 'time_budget:=0'
@@ -223,9 +238,11 @@ def test_the_node_answers_as_the_replay_does_and_changes_its_mind_at_run_time(tm
             assert client.connected() and client.insist(lambda: client.paths, pair=masks, every=1.0), node.log
             assert np.array_equal(ros.points(client.paths[max(client.paths)]), ros.points(offline))
             answered = client.set('image_kind', 'mri')
-            assert not answered.successful and 'must be one of xray, silhouette' in answered.reason and client.get('image_kind') == ['silhouette']
+            assert (not answered.successful and 'must be one of xray, silhouette' in answered.reason
+                    and client.get('image_kind') == ['silhouette'])
             assert client.set('image_kind', 'xray').successful
-            refused = lambda: any(s.name.endswith('reconstruction') and 'no_device' in s.message for s in client.statuses)      # noqa: E731
+            refused = lambda: any(s.name.endswith('reconstruction') and 'no_device' in s.message    # noqa: E731
+                                  for s in client.statuses)
             assert client.insist(refused, pair=[0 * m for m in masks])
             client.paths.clear()
             assert client.insist(lambda: client.paths, every=1.0), node.log     # X-ray images again

@@ -16,7 +16,8 @@ HALF_WIDTH = 2.0        # px
 
 
 def gains(lines, rows, columns=60, slopes=5):
-    """(rows, slopes, columns) that are 1 along lines (column of the first row, columns a row), whatever the slope, and -1 elsewhere."""
+    """(rows, slopes, columns) that are 1 along lines (column of the first row, columns a row), whatever the slope, and
+    -1 elsewhere."""
     gain = np.full((rows, slopes, columns), -1, np.float32)
     for start, slope in lines:
         for row in range(rows):
@@ -76,7 +77,8 @@ def test_a_device_is_darker_where_it_points_to_the_source():
     d = np.linalg.norm(a)
     straight, oblique = _expected(rays, d + np.array([-0.001, 0, 0.001]) * d, a, b)[1][1:]
     assert_allclose(straight, 0, atol=1e-3)                 # across both rays: as dark in both
-    assert_allclose(oblique, np.log(np.sqrt(0.5)), atol=1e-2)       # 45 degrees to the first plane's ray, across the second's: there sqrt(2) fainter
+    # 45 degrees to the first plane's ray, across the second's: there sqrt(2) fainter
+    assert_allclose(oblique, np.log(np.sqrt(0.5)), atol=1e-2)
 
 
 @pytest.mark.parametrize(('seed', 'swept'), [(0, 0), (0, 1), (1, 0), (1, 1)])

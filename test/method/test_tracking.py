@@ -1,4 +1,5 @@
-"""Starting from the pair before: the same answers as a search of the whole images, also where the device moves fast, jumps or is gone for a while."""
+"""Starting from the pair before: the same answers as a search of the whole images, also where the device moves fast,
+jumps or is gone for a while."""
 
 from dataclasses import replace
 from functools import cache
@@ -31,7 +32,8 @@ CONFIG = Config.from_values(base_position=run().backbone()[0].tolist())
 def pictures(shapes):
     """Scenes of the run's device in these shapes, each with noise of its own, 15 a second."""
     scenes = [replace(run(), shape=shape).scene(index=k) for k, shape in enumerate(shapes)]
-    return [replace(scene, frame=replace(scene.frame, stamp_ns=10**9 + k * 10**9 // 15)) for k, scene in enumerate(scenes)]
+    return [replace(scene, frame=replace(scene.frame, stamp_ns=10**9 + k * 10**9 // 15))
+            for k, scene in enumerate(scenes)]
 
 
 def moved(x, y=0.0, z=0.0):
@@ -56,7 +58,8 @@ def follow(scenes, previous=None):
 
 
 def same(a, b):
-    """Whether two shapes are within SAME of each other, taken over their lengths, and their tips within what noise does to a tip."""
+    """Whether two shapes are within SAME of each other, taken over their lengths, and their tips within what noise does
+    to a tip."""
     fine = [np.array([np.interp(np.linspace(0, x.length, 4000), x.s, c) for c in x.points.T]).T for x in (a, b)]
     between = max(cKDTree(one).query(other)[0].mean() for one, other in (fine, fine[::-1]))
     return between < SAME and np.linalg.norm(a.tip - b.tip) < SAME_TIP
@@ -71,7 +74,7 @@ MOTIONS = {
     'sliding in': [posed(run().shape, 1 - k / 5, 0.0) for k in range(5)],       # by 2.4 to 2.8 mm a pair
     'bending': [posed(run().shape, 0.0, k / 5) for k in range(5)],
     'fast across': [moved(k * STEP * 0.6, -k * STEP * 0.6, k * STEP * 0.53) for k in range(5)],
-    'back and forth': [moved(STEP * (k % 2)) for k in range(5)],                # whatever was expected from the pairs before is wrong
+    'back and forth': [moved(STEP * (k % 2)) for k in range(5)],  # whatever was expected from the pairs before is wrong
 }
 
 
@@ -96,13 +99,16 @@ def test_a_device_faster_than_any_search_around_it_is_expected_where_it_will_be(
 
 def test_a_tip_that_swings_while_most_of_the_device_stays_is_followed():
     entering = xray_run(7, views=VIEWS, lengths=(0.10, 0.12), entering=True)
-    scenes = [replace(entering, shape=posed(entering.shape, 0.0, 0.5 * k)).scene(index=k) for k in range(4)]     # the tip by 3.7 mm a pair
+    # the tip by 3.7 mm a pair
+    scenes = [replace(entering, shape=posed(entering.shape, 0.0, 0.5 * k)).scene(index=k) for k in range(4)]
     for scene, answer in zip(scenes[1:], follow(scenes)[1:]):
-        assert answer.shape is not None and np.linalg.norm(answer.shape.tip - scene.truth[-1]) < 2 * RIGHT, answer.detail
+        assert (answer.shape is not None
+                and np.linalg.norm(answer.shape.tip - scene.truth[-1]) < 2 * RIGHT), answer.detail
         assert 'search' not in answer.stage_seconds
 
 
-@pytest.mark.parametrize('there', [moved(0.02, 0.0, -0.02), posed(run().shape, 1.0, 1.0)], ids=['elsewhere', 'another shape'])
+@pytest.mark.parametrize('there', [moved(0.02, 0.0, -0.02), posed(run().shape, 1.0, 1.0)],
+                         ids=['elsewhere', 'another shape'])
 def test_a_device_that_jumps_is_found_in_the_same_pair(there):
     before, after = pictures([run().shape, there])
     answer = follow([before, after])[1]
@@ -134,5 +140,6 @@ def test_where_the_device_is_no_more_everything_is_searched():
 def test_without_tracking_the_previous_shape_changes_nothing():
     scene, = pictures([run().shape])
     config = CONFIG.replace(tracking=False)
-    plain, given = reconstruct(scene.frame, config), reconstruct(scene.frame, config, Prior(previous=search(scene).shape))
+    plain, given = reconstruct(scene.frame, config), reconstruct(scene.frame, config,
+                                                                 Prior(previous=search(scene).shape))
     assert 'track' not in given.stage_seconds and np.array_equal(plain.shape.points, given.shape.points)

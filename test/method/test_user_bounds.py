@@ -12,7 +12,13 @@ from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Outcome
 from fluoro_shape_ros.method.backbone import CALIBRATION_PX
 from fluoro_shape_ros.method.pipeline import reconstruct
-from fluoro_shape_ros.method.user_bounds import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
+from fluoro_shape_ros.method.user_bounds import (
+    check_curvature,
+    check_length,
+    check_reprojection,
+    check_tip,
+    curvature_limit,
+)
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 
@@ -52,14 +58,16 @@ def test_tip_sigma_is_that_of_the_worst_direction():
     assert outcome is Outcome.TIP_UNCERTAIN and '0.30 mm exceeds 0.29 mm' in why
 
 
-@pytest.mark.parametrize('covariance', [np.diag([np.inf, 1e-8, 1e-8]), np.full((3, 3), np.inf), np.full((3, 3), np.nan)],
+@pytest.mark.parametrize('covariance', [np.diag([np.inf, 1e-8, 1e-8]), np.full((3, 3), np.inf),
+                                        np.full((3, 3), np.nan)],
                          ids=['one way', 'all ways', 'NaN'])
 def test_a_tip_nobody_knows_exceeds_every_limit(covariance):
     assert check_tip(covariance, Config.from_values(max_tip_sigma=1.0))[0] is Outcome.TIP_UNCERTAIN
     assert check_tip(covariance, Config()) is None
 
 
-SCENES = dict(views=biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512)), lengths=(0.06, 0.07), anatomy=False)
+SCENES = dict(views=biplane(arm=CArm(pixel_size_iso=0.3e-3, width=512, height=512)), lengths=(0.06, 0.07),
+              anatomy=False)
 
 
 @pytest.mark.parametrize('kind, seed', [('spline', 0), ('spline', 1), ('tangent', 0), ('tangent', 3)])
@@ -76,12 +84,15 @@ def test_half_a_pixel_of_calibration_error_is_borne_or_named(kind, seed):
 
 
 def tip_surprise(scene, error_px=(0.0, 0.0)):
-    """Squared distance of the tip found from the true one, by its covariance: chi square of 3 degrees of freedom where that is honest.
+    """Squared distance of the tip found from the true one, by its covariance: chi square of 3 degrees of freedom where
+    that is honest.
 
     error_px: (2, 2) u and v by which the calibration of each plane is off.
     """
-    views = tuple(replace(v, P=v.P + np.outer([*e, 0.0], v.P[2])) for v, e in zip(scene.frame.views, np.broadcast_to(error_px, (2, 2))))
-    shape = reconstruct(replace(scene.frame, views=views), Config.from_values(base_position=scene.base_position.tolist())).shape
+    views = tuple(replace(v, P=v.P + np.outer([*e, 0.0], v.P[2]))
+                  for v, e in zip(scene.frame.views, np.broadcast_to(error_px, (2, 2))))
+    shape = reconstruct(replace(scene.frame, views=views),
+                        Config.from_values(base_position=scene.base_position.tolist())).shape
     error = shape.tip - scene.truth[-1]
     return float(error @ np.linalg.solve(shape.covariance[-1], error))
 

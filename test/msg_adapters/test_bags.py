@@ -41,7 +41,8 @@ def test_there_and_back(tmp_path, storage):
         assert bag.types() == {TOPIC: 'sensor_msgs/msg/Image', '/plane_a/camera_info': 'sensor_msgs/msg/CameraInfo'}
         assert (bag.count([TOPIC]), bag.count([TOPIC, '/plane_a/camera_info']), bag.start_ns) == (3, 3, 11)
         got = list(bag.messages([TOPIC, '/nothing']))
-    assert [(r.topic, r.log_ns, stamp_ns(r.message)) for r in got] == [(TOPIC, 11, 10), (TOPIC, 21, 20), (TOPIC, 31, 30)]
+    assert [(r.topic, r.log_ns, stamp_ns(r.message)) for r in got] == [(TOPIC, 11, 10), (TOPIC, 21, 20),
+                                                                       (TOPIC, 31, 30)]
     assert np.array_equal(image_to_array(got[0].message), PIXELS)
 
 
@@ -60,7 +61,8 @@ def test_a_bag_without_messages(tmp_path, storage):
         assert list(bag.messages([TOPIC])) == []
 
 
-@pytest.mark.parametrize('name, storage, file', [('run', None, 'run.mcap'), ('run.db3', None, 'run.db3.db3'), ('run.db3', 'mcap', 'run.db3.mcap')])
+@pytest.mark.parametrize('name, storage, file', [('run', None, 'run.mcap'), ('run.db3', None, 'run.db3.db3'),
+                                                 ('run.db3', 'mcap', 'run.db3.mcap')])
 def test_the_suffix_or_the_option_picks_the_storage(tmp_path, name, storage, file):
     assert (write(tmp_path / name, storage) / file).exists()
 
@@ -77,15 +79,18 @@ def test_the_same_content_gives_the_same_bytes(tmp_path, storage):
     assert {f.name: f.read_bytes() for f in first.iterdir()} == {f.name: f.read_bytes() for f in second.iterdir()}
 
 
-@pytest.mark.parametrize('plugin, mode', [(StoragePlugin.SQLITE3, CompressionMode.FILE), (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-                                          (StoragePlugin.MCAP, CompressionMode.STORAGE), (StoragePlugin.MCAP, CompressionMode.FILE)])
+@pytest.mark.parametrize('plugin, mode', [(StoragePlugin.SQLITE3, CompressionMode.FILE),
+                                          (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+                                          (StoragePlugin.MCAP, CompressionMode.STORAGE),
+                                          (StoragePlugin.MCAP, CompressionMode.FILE)])
 def test_compressed_bags(tmp_path, plugin, mode):
     types = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(tmp_path / 'run', version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         connection = writer.add_connection(TOPIC, 'sensor_msgs/msg/Image', typestore=types)
-        writer.write(connection, 11, types.serialize_cdr(array_to_image(PIXELS, 10, 'f', bag_message(types)), connection.msgtype))
+        writer.write(connection, 11, types.serialize_cdr(array_to_image(PIXELS, 10, 'f', bag_message(types)),
+                                                         connection.msgtype))
     with open_bag(tmp_path / 'run') as bag:
         assert [np.array_equal(image_to_array(r.message), PIXELS) for r in bag.messages([TOPIC])] == [True]
 
@@ -101,7 +106,8 @@ def test_a_copied_message_stays_the_same(tmp_path):
         for r in bag.messages([TOPIC]):
             out.write(TOPIC, r.message, r.log_ns)
     with open_bag(tmp_path / 'copy') as bag:
-        assert [(r.log_ns, np.array_equal(image_to_array(r.message), PIXELS)) for r in bag.messages([TOPIC])] == [(11, True), (21, True), (31, True)]
+        assert ([(r.log_ns, np.array_equal(image_to_array(r.message), PIXELS)) for r in bag.messages([TOPIC])]
+                == [(11, True), (21, True), (31, True)])
 
 
 def test_nothing_is_overwritten(tmp_path):
@@ -148,7 +154,8 @@ def test_what_is_left_of_a_truncated_bag_is_read(tmp_path, storage, kept):
     path = write(tmp_path / 'run', storage, LONG)
     cut(path, kept)
     stamps, damage = read_all(path)
-    assert stamps == list(LONG)[:len(stamps)] and 1 >= len(stamps) / len(LONG) > kept - 0.35    # the last chunk of 1 MB is lost
+    # the last chunk of 1 MB is lost
+    assert stamps == list(LONG)[:len(stamps)] and 1 >= len(stamps) / len(LONG) > kept - 0.35
     assert 'run: damaged: ' in damage and '\n' not in damage
 
 
@@ -181,7 +188,9 @@ def test_compressed_bags_that_are_cut_off(tmp_path):
         with writer:
             connection = writer.add_connection(TOPIC, 'sensor_msgs/msg/Image', typestore=types)
             for stamp in LONG[:200]:
-                writer.write(connection, stamp, types.serialize_cdr(array_to_image(PIXELS, stamp, 'f', bag_message(types)), connection.msgtype))
+                writer.write(connection, stamp,
+                             types.serialize_cdr(array_to_image(PIXELS, stamp, 'f', bag_message(types)),
+                                                 connection.msgtype))
         cut(path, 0.9)
         stamps, damage = read_all(path)
         assert stamps == list(LONG)[:len(stamps)] and len(stamps) > 10 and damage, mode
@@ -191,18 +200,21 @@ def test_what_would_take_all_memory_is_left_out(tmp_path, monkeypatch):
     """Messages that say they are longer than a limit, here one of 1 KB, when they are unpacked."""
     monkeypatch.setattr(salvage, 'SIZE_LIMIT', 1000)
     types = get_typestore(Stores.ROS2_JAZZY)
-    for storage, mode in ((StoragePlugin.SQLITE3, CompressionMode.MESSAGE), (StoragePlugin.MCAP, CompressionMode.STORAGE)):
+    for storage, mode in ((StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+                          (StoragePlugin.MCAP, CompressionMode.STORAGE)):
         writer = Writer(tmp_path / storage.name, version=9, storage_plugin=storage)
         writer.set_compression(mode, CompressionFormat.ZSTD)
         with writer:
             connection = writer.add_connection(TOPIC, 'sensor_msgs/msg/Image', typestore=types)
-            writer.write(connection, 11, types.serialize_cdr(array_to_image(PIXELS, 10, 'f', bag_message(types)), connection.msgtype))
+            writer.write(connection, 11, types.serialize_cdr(array_to_image(PIXELS, 10, 'f', bag_message(types)),
+                                                             connection.msgtype))
         (tmp_path / storage.name / 'metadata.yaml').unlink()
         with pytest.raises(BadBag, match='can\'t be read as a bag'):
             read_all(tmp_path / storage.name)
 
 
-@pytest.mark.parametrize('line, other', [('message_count: 3', 'message_count: many'), (f'name: {TOPIC}', 'name: [1, 2]'),
+@pytest.mark.parametrize('line, other', [('message_count: 3', 'message_count: many'),
+                                         (f'name: {TOPIC}', 'name: [1, 2]'),
                                          ('type: sensor_msgs/msg/Image', 'type: 7')])
 def test_metadata_of_another_kind_are_damage(tmp_path, line, other):
     path = write(tmp_path / 'run')
@@ -214,11 +226,14 @@ def test_metadata_of_another_kind_are_damage(tmp_path, line, other):
 
 
 @pytest.mark.parametrize('rows', [
-    "(1, 1, 5, x'01'), (1, 1, 6, x'02')", "('a', 1, 5, x'01'), ('b', 1, 6, x'02')", f"({2**63 - 1}, 1, 5, x'01')", "(1, 1, 'now', x'01'), (2, x'01', 5, 7)"])
+    "(1, 1, 5, x'01'), (1, 1, 6, x'02')", "('a', 1, 5, x'01'), ('b', 1, 6, x'02')", f"({2**63 - 1}, 1, 5, x'01')",
+    "(1, 1, 'now', x'01'), (2, x'01', 5, 7)"])
 def test_rows_that_are_none_end_nothing(tmp_path, rows):
     with contextlib.closing(sqlite3.connect(tmp_path / 'run.db3')) as database:
-        database.executescript(f'''CREATE TABLE topics(id, name, type); INSERT INTO topics VALUES (1, '/a', 'b'), (2, 3, 4);
-                                   CREATE TABLE messages(id, topic_id, timestamp, data); INSERT INTO messages VALUES {rows};''')
+        database.executescript(f'''CREATE TABLE topics(id, name, type);
+                                   INSERT INTO topics VALUES (1, '/a', 'b'), (2, 3, 4);
+                                   CREATE TABLE messages(id, topic_id, timestamp, data);
+                                   INSERT INTO messages VALUES {rows};''')
     assert len(list(salvage.sqlite_messages(tmp_path / 'run.db3'))) <= 1
 
 
@@ -226,9 +241,12 @@ def test_rows_that_are_none_end_nothing(tmp_path, rows):
 def test_rows_without_end_are_given_up(tmp_path, name):
     """As pages that follow one another in a circle give them; fuzz.py found such a file."""
     with contextlib.closing(sqlite3.connect(tmp_path / 'run.db3')) as database:
-        database.executescript(f'''CREATE TABLE topics(id, name, type); CREATE TABLE messages(id, topic_id, timestamp, data); DROP TABLE {name};
-                                   CREATE VIEW {name} AS WITH RECURSIVE same(x) AS (SELECT 0 UNION ALL SELECT 0 FROM same)
-                                   SELECT x AS id, 'a' AS name, 'b' AS type, x AS topic_id, x AS timestamp, x AS data FROM same;''')
+        database.executescript(f'''CREATE TABLE topics(id, name, type);
+                                   CREATE TABLE messages(id, topic_id, timestamp, data); DROP TABLE {name};
+                                   CREATE VIEW {name} AS
+                                   WITH RECURSIVE same(x) AS (SELECT 0 UNION ALL SELECT 0 FROM same)
+                                   SELECT x AS id, 'a' AS name, 'b' AS type, x AS topic_id, x AS timestamp,
+                                          x AS data FROM same;''')
     assert not list(salvage.sqlite_messages(tmp_path / 'run.db3'))
 
 
@@ -271,11 +289,14 @@ def test_a_bag_with_garbage_in_it_never_ends_in_another_error(tmp_path, storage)
 
 def test_a_full_disk_is_named(tmp_path):
     """A limit of the file size stands in for the disk's; in a process of its own, which it holds for."""
-    code = ('import resource, sys\nfrom test_bags import write\nresource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n'
-            'try:\n    write(sys.argv[1], sys.argv[2], range(10, 2010))\nexcept ValueError as error:\n    print(type(error).__name__, error)\n')
+    code = ('import resource, sys\nfrom test_bags import write\nresource.setrlimit(resource.RLIMIT_FSIZE, '
+            '(200_000, 200_000))\ntry:\n    write(sys.argv[1], sys.argv[2], range(10, 2010))\n'
+            'except ValueError as error:\n    print(type(error).__name__, error)\n')
     for storage in ('mcap', 'sqlite3'):
         path = tmp_path / storage
-        done = subprocess.run([sys.executable, '-c', f'import sys\nsys.path[:0] = {[*sys.path, str(Path(__file__).parents[1])]!r}\n{code}', str(path), storage],
+        done = subprocess.run([sys.executable, '-c',
+                               f'import sys\nsys.path[:0] = {[*sys.path, str(Path(__file__).parents[1])]!r}\n{code}',
+                               str(path), storage],
                               capture_output=True, text=True, timeout=120)
         assert done.stdout.startswith(f'BadBag {path}: can\'t be written (') and not done.stderr, done
         assert not path.exists()
@@ -286,7 +307,8 @@ def test_a_full_disk_is_named(tmp_path):
     (lambda p: p.mkdir(), 'can\'t be read'),
     (lambda p: p.write_text('hello'), 'can\'t be read'),
     (lambda p: (p.mkdir(), (p / 'metadata.yaml').write_text('hello')), 'can\'t be read'),
-    (lambda p: (p.mkdir(), (p / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  version: 99')), 'can\'t be read'),
+    (lambda p: (p.mkdir(), (p / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  version: 99')),
+     'can\'t be read'),
 ], ids=['missing', 'empty folder', 'text file', 'no metadata', 'from the future'])
 def test_what_is_no_bag_is_named(tmp_path, make, says):
     make(tmp_path / 'run')

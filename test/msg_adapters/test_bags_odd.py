@@ -1,4 +1,5 @@
-"""Bags as other programs leave them: whole ones are read and not called damaged, and what is missing is said with every failure."""
+"""Bags as other programs leave them: whole ones are read and not called damaged, and what is missing is said with every
+failure."""
 
 import contextlib
 import re
@@ -50,7 +51,8 @@ def read(path):
     """The stamps of both topics as they come, whether the pixels are right, and the damage."""
     with open_bag(path) as bag:
         got = list(bag.messages([TOPIC, OTHER]))
-        return [(r.topic, stamp_ns(r.message)) for r in got], all(np.array_equal(image_to_array(r.message), PIXELS) for r in got), bag.damage
+        return ([(r.topic, stamp_ns(r.message)) for r in got],
+                all(np.array_equal(image_to_array(r.message), PIXELS) for r in got), bag.damage)
 
 
 ALL = [(topic, stamp) for stamp in STAMPS for topic in (TOPIC, OTHER)]
@@ -64,16 +66,19 @@ def edit(path, pattern, other):
 
 
 def mcap(path, found, *, profile='ros2', encoding='cdr', schema_encoding='ros2msg', definition=b'', more=()):
-    """Write messages (see `messages`) as an MCAP file, with what is said of them; `more` are topic, encodings and data of others."""
+    """Write messages (see `messages`) as an MCAP file, with what is said of them; `more` are topic, encodings and data
+    of others."""
     with path.open('wb') as file:
         writer, channels = McapWriter(file), {}
         writer.start(profile=profile, library='test')
         for topic, kind, log_ns, raw in found:
             if topic not in channels:
-                channels[topic] = writer.register_channel(topic, encoding, writer.register_schema(kind, schema_encoding, definition))
+                channels[topic] = writer.register_channel(topic, encoding,
+                                                          writer.register_schema(kind, schema_encoding, definition))
             writer.add_message(channels[topic], log_ns, raw, log_ns)
         for topic, message_encoding, other_encoding, data in more:
-            channel = writer.register_channel(topic, message_encoding, writer.register_schema('some.Type', other_encoding, b'\x0a\x01x'))
+            channel = writer.register_channel(topic, message_encoding,
+                                              writer.register_schema('some.Type', other_encoding, b'\x0a\x01x'))
             writer.add_message(channel, 15, data, 15)
         writer.finish()
     return path
@@ -89,9 +94,11 @@ def mcap(path, found, *, profile='ros2', encoding='cdr', schema_encoding='ros2ms
     (r'nanoseconds: \d+', 'nanoseconds: 1'),                    # of the bag and its files
     (r'nanoseconds_since_epoch: \d+', 'nanoseconds_since_epoch: 999999999999'),
     (r'relative_file_paths:\n( *)- .*', r'relative_file_paths:\n\1- renamed_0.mcap'),
-    (r'offered_qos_profiles: .*', 'offered_qos_profiles: "- history: 3\\\\n  depth: 0\\\\n  reliability: 1\\\\n  durability: 2\\\\n  deadline: {sec: 1, nsec: 5}'
-                                  '\\\\n  lifespan: {sec: 1, nsec: 5}\\\\n  liveliness: 1\\\\n  liveliness_lease_duration: {sec: 1, nsec: 5}'
-                                  '\\\\n  avoid_ros_namespace_conventions: false"'),    # durations of the QoS: rosbags drops the topic without a word
+    (r'offered_qos_profiles: .*', 'offered_qos_profiles: "- history: 3\\\\n  depth: 0\\\\n  reliability: '
+                                  '1\\\\n  durability: 2\\\\n  deadline: {sec: 1, nsec: 5}\\\\n  lifespan: {sec: '
+                                  '1, nsec: 5}\\\\n  liveliness: 1\\\\n  liveliness_lease_duration: {sec: 1, nsec: 5}'
+                                  # durations of the QoS: rosbags drops the topic without a word
+                                  '\\\\n  avoid_ros_namespace_conventions: false"'),
 ], ids=['no storage', 'version', 'durations', 'start', 'renamed', 'qos durations'])
 def test_metadata_that_others_wrote(tmp_path, storage, pattern, other):
     path = write(tmp_path / 'run', storage)
@@ -116,7 +123,8 @@ def test_padding_after_messages(tmp_path, padding):
     path = write(tmp_path / 'other', 'sqlite3')
     with contextlib.closing(sqlite3.connect(storage_file(path))) as database, database:
         rows = database.execute('SELECT data, id FROM messages').fetchall()
-        database.executemany('UPDATE messages SET data = ? WHERE id = ?', [(raw + padding, number) for raw, number in rows])
+        database.executemany('UPDATE messages SET data = ? WHERE id = ?',
+                             [(raw + padding, number) for raw, number in rows])
     assert read(path) == (ALL, True, '')
 
 
@@ -165,8 +173,10 @@ def test_compressed_files_that_were_renamed(tmp_path):
 
 @pytest.mark.parametrize('profile', ['ros1', ''])
 def test_an_mcap_of_ros_1_is_called_so(tmp_path, capsys, profile):
-    found = [(topic, 'sensor_msgs/Image', log_ns, raw[4:]) for topic, _, log_ns, raw in messages(write(tmp_path / 'run'))]
-    path = mcap(tmp_path / 'old.mcap', found, profile=profile, encoding='ros1', schema_encoding='ros1msg', definition=b'Header header')
+    found = [(topic, 'sensor_msgs/Image', log_ns, raw[4:])
+             for topic, _, log_ns, raw in messages(write(tmp_path / 'run'))]
+    path = mcap(tmp_path / 'old.mcap', found, profile=profile, encoding='ros1', schema_encoding='ros1msg',
+                definition=b'Header header')
     with pytest.raises(BadBag, match='old.mcap: can\'t be read as a bag .*ROS 1; convert'), open_bag(path):
         pass
     assert main(path, '--out', tmp_path / 'out') == 1
@@ -209,10 +219,12 @@ def test_damage_is_printed_with_every_failure(tmp_path, capsys, storage):
         mcap(storage_file(path), found)
     else:
         with contextlib.closing(sqlite3.connect(storage_file(path))) as database, database:
-            database.execute('UPDATE messages SET data = substr(data, 1, 200) WHERE topic_id = (SELECT id FROM topics WHERE name = ?)', (TOPIC,))
+            database.execute('UPDATE messages SET data = substr(data, 1, 200) WHERE topic_id = '
+                             '(SELECT id FROM topics WHERE name = ?)', (TOPIC,))
     assert main(path, '--out', tmp_path / 'out') == 1
     error = capsys.readouterr().err
-    assert f'a message on {TOPIC} can\'t be read as {IMAGE}' in error and '0 of plane A' in error and len(error.splitlines()) == 1
+    assert (f'a message on {TOPIC} can\'t be read as {IMAGE}' in error and '0 of plane A' in error
+            and len(error.splitlines()) == 1)
 
 
 def test_a_topic_that_is_announced_and_gone_is_said_with_the_failure(tmp_path, capsys):
@@ -220,7 +232,8 @@ def test_a_topic_that_is_announced_and_gone_is_said_with_the_failure(tmp_path, c
     mcap(storage_file(path), [m for m in messages(path) if m[0] != TOPIC])
     assert main(path, '--out', tmp_path / 'out') == 1
     error = capsys.readouterr().err
-    assert f'{TOPIC} is not in the bag' in error and f'2 messages on {TOPIC} are announced, and none is there' in error and len(error.splitlines()) == 1
+    assert (f'{TOPIC} is not in the bag' in error and f'2 messages on {TOPIC} are announced, and none is there' in error
+            and len(error.splitlines()) == 1)
 
 
 def test_topics_that_were_filtered_out_of_a_bag_are_no_damage(tmp_path):

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from msg_adapters.calibration import BadCalibration, Calibration, calibration_to_camera_info, read_calibration, write_calibration
+from msg_adapters.calibration import (
+    BadCalibration,
+    Calibration,
+    calibration_to_camera_info,
+    read_calibration,
+    write_calibration,
+)
 from msg_adapters.messages import stamp_ns
 
 pytest.importorskip('yaml')
@@ -57,7 +63,8 @@ def test_distortion_may_be_missing(tmp_path):
 
 def test_what_is_written_reads_the_same(tmp_path):
     rng = np.random.default_rng(1)
-    c = Calibration('b', 3, 2, rng.normal(size=(3, 3)), rng.normal(size=(3, 4)), 'equidistant', rng.normal(size=4) * 1e-9, rng.normal(size=(3, 3)))
+    c = Calibration('b', 3, 2, rng.normal(size=(3, 3)), rng.normal(size=(3, 4)), 'equidistant',
+                    rng.normal(size=4) * 1e-9, rng.normal(size=(3, 3)))
     write_calibration(tmp_path / 'b.yaml', c)
     again = read_calibration(tmp_path / 'b.yaml')
     assert (again.camera_name, again.width, again.height, again.distortion_model) == ('b', 3, 2, 'equidistant')
@@ -67,7 +74,8 @@ def test_what_is_written_reads_the_same(tmp_path):
 
 def test_becomes_a_camera_info(tmp_path, new):
     msg = calibration_to_camera_info(read(tmp_path, TEXT), 2_000_000_005, 'plane_a_optical', new)
-    assert (stamp_ns(msg), msg.header.frame_id, msg.width, msg.height, msg.distortion_model) == (2_000_000_005, 'plane_a_optical', 640, 480, 'plumb_bob')
+    assert ((stamp_ns(msg), msg.header.frame_id, msg.width, msg.height, msg.distortion_model)
+            == (2_000_000_005, 'plane_a_optical', 640, 480, 'plumb_bob'))
     assert list(msg.p) == list(range(1, 13))
     assert list(msg.k) == [1000.5, 0, 320, 0, 1000, 240, 0, 0, 1]
     assert list(msg.d) == [-0.2, 0.05, 1e-5, -0.002, 0]

@@ -1,4 +1,5 @@
-"""Calibrations as other programs write them: the same two cameras in every format, with P = K [R | t] worked out here."""
+"""Calibrations as other programs write them: the same two cameras in every format, with P = K [R | t] worked out
+here."""
 
 from pathlib import Path
 
@@ -61,7 +62,8 @@ OPENCV = dict(M1=K1, D1=D1, M2=K2, D2=D2, R=R, T=T)
 
 @pytest.mark.parametrize('suffix', ['yml', 'yaml', 'xml', 'json'])
 def test_a_stereo_pair_of_opencvs_file_storage(suffix):
-    a, b, said = planes(file_storage(f'stereo.{suffix}', **OPENCV, image_width=640, image_height=480, R1=np.eye(3), P1=P1, Q=np.eye(4)))
+    a, b, said = planes(file_storage(f'stereo.{suffix}', **OPENCV, image_width=640, image_height=480, R1=np.eye(3),
+                                     P1=P1, Q=np.eye(4)))
     check(a, b)
     assert not said
 
@@ -82,13 +84,15 @@ def test_intrinsics_and_extrinsics_in_two_files_as_stereo_calib_writes_them():
     dict(K1='mtxL', D1='distL', K2='mtxR', D2='distR', R='Rot', T='trans'),
     dict(K1='cameraMatrix1', D1='distCoeffs1', K2='cameraMatrix2', D2='distCoeffs2', R='R', T='T'),
     dict(K1='intrinsics1', D1='distortion1', K2='intrinsics2', D2='distortion2', R='R', T='T'),
-    dict(K1='left_camera_matrix', D1='left_dist_coeffs', K2='right_camera_matrix', D2='right_dist_coeffs', R='rotation_matrix', T='translation_vector'),
+    dict(K1='left_camera_matrix', D1='left_dist_coeffs', K2='right_camera_matrix', D2='right_dist_coeffs',
+         R='rotation_matrix', T='translation_vector'),
     dict(K1='K_a', D1='D_a', K2='K_b', D2='D_b', R='R', T='T'),
     dict(K1='K0', D1='D0', K2='K1', D2='D1', R='R', T='T'),
 ], ids=lambda names: names['K1'])
 @pytest.mark.parametrize('kind', ['npz', 'mat'])
 def test_matrices_by_whatever_name(names, kind):
-    values = {names[key]: value for key, value in dict(K1=K1, D1=D1[None], K2=K2, D2=D2[None], R=R, T=T[:, None]).items()}
+    values = {names[key]: value
+              for key, value in dict(K1=K1, D1=D1[None], K2=K2, D2=D2[None], R=R, T=T[:, None]).items()}
     if kind == 'npz':
         np.savez('stereo.npz', **values, image_size=np.array(SIZE), E=np.eye(3))
     else:
@@ -97,7 +101,8 @@ def test_matrices_by_whatever_name(names, kind):
 
 
 def test_a_camera_by_itself_stands_in_the_reference_frame():
-    np.savez('b.npz', mtx=K2, dist=D2, rvec=Rotation.from_matrix(R).as_rotvec(), tvec=T, img_shape=np.array([480, 640, 3]))
+    np.savez('b.npz', mtx=K2, dist=D2, rvec=Rotation.from_matrix(R).as_rotvec(), tvec=T,
+             img_shape=np.array([480, 640, 3]))
     file_storage('b.xml', camera_matrix=K2, distortion_coefficients=D2, R=R, T=T, image_width=640, image_height=480)
     for name in ('b.npz', 'b.xml'):
         (found,) = read_cameras(name)
@@ -105,8 +110,11 @@ def test_a_camera_by_itself_stands_in_the_reference_frame():
         assert (found.calibration.width, found.calibration.height) == SIZE
 
 
-@pytest.mark.parametrize('D, extra, model', [(np.zeros(5), {}, 'plumb_bob'), (np.arange(8.0), {}, 'rational_polynomial'), (np.arange(14.0), {}, 'rational_polynomial'),
-                                             (np.arange(4.0), dict(fisheye_model=1), 'equidistant'), (np.arange(4.0), dict(distortion_model='fisheye'), 'fisheye')])
+@pytest.mark.parametrize('D, extra, model', [(np.zeros(5), {}, 'plumb_bob'),
+                                             (np.arange(8.0), {}, 'rational_polynomial'),
+                                             (np.arange(14.0), {}, 'rational_polynomial'),
+                                             (np.arange(4.0), dict(fisheye_model=1), 'equidistant'),
+                                             (np.arange(4.0), dict(distortion_model='fisheye'), 'fisheye')])
 def test_the_model_is_told_by_the_number_of_coefficients(D, extra, model):
     found = read_cameras(file_storage('c.yml', K=K1, D=D, R=R, T=T, **extra))[0]
     assert found.calibration.distortion_model == model and np.array_equal(found.calibration.D, D)
@@ -117,13 +125,15 @@ def test_the_model_is_told_by_the_number_of_coefficients(D, extra, model):
 
 def mayacam(name, K, R, t):
     row = lambda values: ','.join(f'{v:.12g}' for v in values)       # noqa: E731
-    parts = ['image size', '640,480', '', 'camera matrix', *map(row, K), '', 'rotation', *map(row, R), '', 'translation', *(f'{v:.12g}' for v in t), '']
+    parts = ['image size', '640,480', '', 'camera matrix', *map(row, K), '', 'rotation', *map(row, R), '',
+             'translation', *(f'{v:.12g}' for v in t), '']
     Path(name).write_bytes('\r\n'.join(parts).encode())
     return name
 
 
 def test_mayacam_2_of_xmalab_in_millimetres():
-    found = [read_cameras(mayacam('a.txt', K1, np.eye(3), [0, 0, 900.0]))[0], read_cameras(mayacam('b.txt', K2, R, 1e3 * T))[0]]
+    found = [read_cameras(mayacam('a.txt', K1, np.eye(3), [0, 0, 900.0]))[0],
+             read_cameras(mayacam('b.txt', K2, R, 1e3 * T))[0]]
     (a, b), said = in_metres(found)
     assert np.allclose(a.P, K1 @ np.c_[np.eye(3), [0, 0, 0.9]]) and np.allclose(b.P, P2) and (a.width, a.height) == SIZE
     assert said == 'the calibrations are in mm, as a source stands 900 from the origin; --unit says otherwise'
@@ -132,12 +142,15 @@ def test_mayacam_2_of_xmalab_in_millimetres():
 
 
 def test_a_vtk_camera_of_autoscoper():
-    """From 800 mm behind the origin along y it looks along y with z up: u runs with x, v against z, and 30 degrees fill either side."""
-    Path('cam.txt').write_text('# VTK\nversion: 1.0\ncamera-position: 0,-800,0\nfocal-point: 0,0,0\nview-up: 0,0,1\nview-angle: 30\nimage-width: 640\nimage-height: 640\n')
+    """From 800 mm behind the origin along y it looks along y with z up: u runs with x, v against z, and 30 degrees fill
+    either side."""
+    Path('cam.txt').write_text('# VTK\nversion: 1.0\ncamera-position: 0,-800,0\nfocal-point: 0,0,0\nview-up: 0,0,1\n'
+                               'view-angle: 30\nimage-width: 640\nimage-height: 640\n')
     (c,), said = in_metres(read_cameras('cam.txt'))
     f = 320 / np.tan(np.pi / 12)
     assert 'in mm' in said and np.allclose(project(c.P, np.zeros(3)), 319.5)
-    assert np.allclose(project(c.P, np.array([0.1, 0, 0])) - 319.5, [f / 8, 0]) and np.allclose(project(c.P, np.array([0, 0, 0.1])) - 319.5, [0, -f / 8])
+    assert (np.allclose(project(c.P, np.array([0.1, 0, 0])) - 319.5, [f / 8, 0])
+            and np.allclose(project(c.P, np.array([0, 0, 0.1])) - 319.5, [0, -f / 8]))
 
 
 # ---- MATLAB
@@ -147,9 +160,10 @@ def stereo_struct(**changes):
     """What toStruct gives, all lengths in mm; MATLAB counts pixels from 1 and multiplies rows from the left."""
     def camera(K, D):
         one_based = K + [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
-        return dict(RadialDistortion=D[[0, 1, 4]], TangentialDistortion=D[2:4], ImageSize=np.array([480.0, 640.0]), IntrinsicMatrix=one_based.T, WorldUnits='millimeters',
-                    NumRadialDistortionCoefficients=3)
-    return dict(CameraParameters1=camera(K1, D1), CameraParameters2=camera(K2, D2), RotationOfCamera2=R.T, TranslationOfCamera2=1e3 * T) | changes
+        return dict(RadialDistortion=D[[0, 1, 4]], TangentialDistortion=D[2:4], ImageSize=np.array([480.0, 640.0]),
+                    IntrinsicMatrix=one_based.T, WorldUnits='millimeters', NumRadialDistortionCoefficients=3)
+    return dict(CameraParameters1=camera(K1, D1), CameraParameters2=camera(K2, D2), RotationOfCamera2=R.T,
+                TranslationOfCamera2=1e3 * T) | changes
 
 
 @pytest.mark.parametrize('nested', [False, True])
@@ -163,7 +177,8 @@ def test_matlabs_stereo_parameters_as_a_struct(nested):
 def test_matlab_since_2022_has_k_as_opencv():
     s = stereo_struct()
     for number, K in ((1, K1), (2, K2)):
-        s[f'CameraParameters{number}'] |= dict(K=K + [[0, 0, 1], [0, 0, 1], [0, 0, 0]], RadialDistortion=np.zeros(2), TangentialDistortion=np.zeros(2), WorldUnits='m')
+        s[f'CameraParameters{number}'] |= dict(K=K + [[0, 0, 1], [0, 0, 1], [0, 0, 0]], RadialDistortion=np.zeros(2),
+                                               TangentialDistortion=np.zeros(2), WorldUnits='m')
         del s[f'CameraParameters{number}']['IntrinsicMatrix']
     s['TranslationOfCamera2'] = T
     scipy.io.savemat('stereo.mat', s)
@@ -188,8 +203,10 @@ def camchain(**changes):
     one = dict(camera_model='pinhole', distortion_model='radtan', resolution=list(SIZE), rostopic='/a')
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = R, T
-    content = dict(cam0=one | dict(intrinsics=K1[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), distortion_coeffs=D1[:4].tolist()),
-                   cam1=one | dict(intrinsics=K2[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), distortion_coeffs=D2[:4].tolist(), T_cn_cnm1=pose.tolist()))
+    content = dict(cam0=one | dict(intrinsics=K1[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
+                                   distortion_coeffs=D1[:4].tolist()),
+                   cam1=one | dict(intrinsics=K2[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
+                                   distortion_coeffs=D2[:4].tolist(), T_cn_cnm1=pose.tolist()))
     content['cam1'] |= changes
     Path('camchain.yaml').write_text(yaml.safe_dump(content))
     return 'camchain.yaml'
@@ -206,7 +223,8 @@ def test_kalibrs_camchain():
         read_cameras(camchain(T_cn_cnm1=[1, 2]))
 
 
-RECTIFIED = K1 @ np.eye(3, 4) - [[0, 0, 0, 90.0], [0] * 4, [0] * 4]      # a baseline of 60 mm, as camera_calibration writes it for the right camera
+# a baseline of 60 mm, as camera_calibration writes it for the right camera
+RECTIFIED = K1 @ np.eye(3, 4) - [[0, 0, 0, 90.0], [0] * 4, [0] * 4]
 
 
 def test_ros_stereo_files():
@@ -250,7 +268,8 @@ def test_millimetres_in_camera_info_yaml_are_recognized():
     (b'cam0: {camera_model: pinhole}\n', 'cam0 needs intrinsics'),
     (b'- ' * 5000, 'no YAML|no calibration'),
     (b'%YAML:1.0\n---\nK: abc\nR: abc\nT: 3\n', 'no number, or no matrix'),
-    (b'image size\n1e999,480\ncamera matrix\n' + b'1,2,3\n' * 3 + b'rotation\n1,0,0\n0,1,0\n0,0,1\ntranslation\n1\n2\n3\n', 'no number, or no matrix'),
+    (b'image size\n1e999,480\ncamera matrix\n' + b'1,2,3\n' * 3
+     + b'rotation\n1,0,0\n0,1,0\n0,0,1\ntranslation\n1\n2\n3\n', 'no number, or no matrix'),
 ])
 def test_what_is_no_calibration_is_named_in_one_line(data, says):
     Path('c.txt').write_bytes(data)
@@ -298,10 +317,12 @@ def info(request):
     else:
         typesys = pytest.importorskip('rosbags.typesys')
         new = bag_message(typesys.get_typestore(typesys.Stores.ROS2_JAZZY))
-    return lambda model, D: new('sensor_msgs/msg/CameraInfo', width=640, height=480, k=K1, p=P2, r=np.eye(3), distortion_model=model, d=np.array(D, float))
+    return lambda model, D: new('sensor_msgs/msg/CameraInfo', width=640, height=480, k=K1, p=P2, r=np.eye(3),
+                                distortion_model=model, d=np.array(D, float))
 
 
-@pytest.mark.parametrize('model', ['', 'plumb_bob', 'rational_polynomial', 'equidistant', 'fisheye', 'none', 'thin_prism_fisheye'])
+@pytest.mark.parametrize('model', ['', 'plumb_bob', 'rational_polynomial', 'equidistant', 'fisheye', 'none',
+                                   'thin_prism_fisheye'])
 @pytest.mark.parametrize('count', [0, 1, 4, 5, 8, 12, 14, 20])
 def test_zeros_are_a_pinhole_whatever_the_model_or_their_number(info, model, count):
     message = info(model, np.zeros(count))
@@ -314,13 +335,15 @@ def test_zeros_are_a_pinhole_whatever_the_model_or_their_number(info, model, cou
     ('plumb_bob', [*D1, *[0] * 9], D1),
     ('rational_polynomial', [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.01, 0.001], None),
     ('rational_polynomial', [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.01, 0.001, 2e-3, 1e-4, -1e-3, 1e-4], None),
-    ('rational_polynomial', [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.01, 0.001, 2e-3, 1e-4, -1e-3, 1e-4, 0.01, -0.02], None),
+    ('rational_polynomial', [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.01, 0.001, 2e-3, 1e-4, -1e-3, 1e-4, 0.01, -0.02],
+     None),
     ('fisheye', [0.1, -0.02, 1e-3, 1e-4], None),
     ('equidistant', [0.1, -0.02, 1e-3, 1e-4, 0], [0.1, -0.02, 1e-3, 1e-4]),
 ], ids=lambda value: value if isinstance(value, str) else '')
 def test_all_lengths_that_opencv_knows(info, model, D, known):
     view = camera_info_to_view(info(model, D), 'a', (480, 640))
-    assert np.array_equal(view.distortion.D, D if known is None else known) and view.distortion.model == model.replace('fisheye', 'equidistant')
+    assert (np.array_equal(view.distortion.D, D if known is None else known)
+            and view.distortion.model == model.replace('fisheye', 'equidistant'))
     points = np.random.default_rng(0).uniform([50, 50], [590, 430], (50, 2))
     assert np.abs(undistort(view, distort(view, points)) - points).max() < 0.01
     assert np.abs(distort(view, points) - points).max() > 0.5

@@ -20,8 +20,10 @@ def info(new):
 
     def make(roi=None, **fields):
         if roi is not None:
-            fields['roi'] = new('sensor_msgs/msg/RegionOfInterest', **dict(zip(('x_offset', 'y_offset', 'width', 'height'), roi)))
-        fields = dict(width=640, height=480, k=K, p=P) | {k: np.asarray(v, float) if k in 'dkrp' else v for k, v in fields.items()}
+            fields['roi'] = new('sensor_msgs/msg/RegionOfInterest',
+                                **dict(zip(('x_offset', 'y_offset', 'width', 'height'), roi)))
+        fields = dict(width=640, height=480, k=K, p=P) | {k: np.asarray(v, float) if k in 'dkrp' else v
+                                                          for k, v in fields.items()}
         return new('sensor_msgs/msg/CameraInfo', **fields)
 
     return make
@@ -44,7 +46,8 @@ def test_roi_shifts_the_pixels(info):
 
 
 def test_binning_joins_pixels(info):
-    # 2x4 binning: columns 340 and 341 make column 170, so that 340 lies a quarter left of its centre; rows 228 to 231 make row 57
+    # 2x4 binning: columns 340 and 341 make column 170, so that 340 lies a quarter left of its centre; rows 228 to 231
+    # make row 57
     v = view(info(binning_x=2, binning_y=4), (120, 320))
     assert_allclose(project(v.P, X), [[169.75, 57.125]])
 
@@ -86,12 +89,14 @@ def test_a_pose_in_p_beside_the_one_given_is_refused(info):
         view(info(p=turned), pose=(np.eye(3), [0, 0, 1.0]))
 
 
-DISTORTIONS = {'plumb_bob': [-0.2, 0.05, 0.001, -0.002, 0.01], 'rational_polynomial': [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.001],
+DISTORTIONS = {'plumb_bob': [-0.2, 0.05, 0.001, -0.002, 0.01],
+               'rational_polynomial': [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.001],
                'equidistant': [-0.05, 0.01, 0.002, -0.001]}
 
 
 @pytest.mark.parametrize('model', DISTORTIONS)
-@pytest.mark.parametrize('window', [dict(), dict(roi=(100, 50, 320, 240), binning_x=2, binning_y=2)], ids=['full', 'roi and binning'])
+@pytest.mark.parametrize('window', [dict(), dict(roi=(100, 50, 320, 240), binning_x=2, binning_y=2)],
+                         ids=['full', 'roi and binning'])
 def test_distortion_there_and_back(info, model, window):
     v = view(info(distortion_model=model, d=DISTORTIONS[model], **window), (120, 160) if window else (480, 640))
     ideal = np.array([[5.0, 7.0], [100.0, 60.0], [159.0, 119.0]])
@@ -109,7 +114,8 @@ def test_radial_distortion_by_hand(info):
 def test_distortion_counts_from_the_full_image(info):
     """The same device point, in the full image and in a binned region of it."""
     given = dict(distortion_model='plumb_bob', d=DISTORTIONS['plumb_bob'])
-    whole, part = view(info(**given)), view(info(roi=(100, 50, 320, 240), binning_x=2, binning_y=2, **given), (120, 160))
+    whole, part = view(info(**given)), view(info(roi=(100, 50, 320, 240), binning_x=2, binning_y=2, **given),
+                                            (120, 160))
     seen, seen_in_part = distort(whole, project(whole.P, X)), distort(part, project(part.P, X))
     assert_allclose(seen_in_part, (seen - [100, 50] + 0.5) / 2 - 0.5, atol=1e-9)
 
@@ -118,14 +124,16 @@ def test_rectifying_rotation_agrees_with_opencv(info):
     R = cv2.Rodrigues(np.array([0.02, -0.03, 0.01]))[0]
     v = view(info(distortion_model='plumb_bob', d=DISTORTIONS['plumb_bob'], r=R))
     raw = np.array([[[100.0, 80.0]], [[500.0, 400.0]]])
-    assert_allclose(undistort(v, raw[:, 0]), cv2.undistortPoints(raw, K, np.array(DISTORTIONS['plumb_bob']), R=R, P=K)[:, 0], atol=0.01)
+    assert_allclose(undistort(v, raw[:, 0]),
+                    cv2.undistortPoints(raw, K, np.array(DISTORTIONS['plumb_bob']), R=R, P=K)[:, 0], atol=0.01)
 
 
 def test_a_rotation_alone_turns_the_rays(info):
     # 0.1 rad about the optical axis: the principal point stays, (420, 240) turns around it
     R = cv2.Rodrigues(np.array([0, 0, 0.1]))[0]
     v = view(info(r=R))
-    assert_allclose(undistort(v, np.array([[320.0, 240], [420.0, 240]])), [[320, 240], [320 + 100 * np.cos(0.1), 240 + 100 * np.sin(0.1)]], atol=1e-6)
+    assert_allclose(undistort(v, np.array([[320.0, 240], [420.0, 240]])),
+                    [[320, 240], [320 + 100 * np.cos(0.1), 240 + 100 * np.sin(0.1)]], atol=1e-6)
 
 
 @pytest.mark.parametrize('fields', [
@@ -139,7 +147,8 @@ def test_no_distortion(info, fields):
 
 
 def test_a_rectified_image_has_none(info):
-    assert view(info(distortion_model='what', d=[1.0], r=cv2.Rodrigues(np.ones(3))[0]), rectified=True).distortion is None
+    assert view(info(distortion_model='what', d=[1.0], r=cv2.Rodrigues(np.ones(3))[0]),
+                rectified=True).distortion is None
 
 
 @pytest.mark.parametrize('fields, says', [
@@ -163,7 +172,8 @@ def test_a_rectified_image_has_none(info):
     (dict(distortion_model='plumb_bob', d=[0.1, 0, 0, np.nan]), 'D has entries that are not finite'),
     (dict(d=[0.1, 0, 0, 0]), 'no distortion model'),
     (dict(r=2 * np.eye(3)), 'R is no rotation'),
-    (dict(r=np.diag([1.3e154, 1, 1])), 'R has entries beyond 1e\\+12'),     # its square overflows, and NaN is not above any limit
+    # its square overflows, and NaN is not above any limit
+    (dict(r=np.diag([1.3e154, 1, 1])), 'R has entries beyond 1e\\+12'),
     (dict(binning_x=10**6), 'leaves no pixel'),
     (dict(r=np.diag([1.0, 1, -1])), 'R is no rotation'),
 ], ids=str)
@@ -172,7 +182,9 @@ def test_what_can_not_be_a_camera_is_named(info, fields, says):
         view(info(**fields))
 
 
-@pytest.mark.parametrize('fields, says', [(dict(d=np.zeros(100_000)), 'D has 100000'), (dict(header='x' * 1000), 'frame_id has 1000 characters')], ids=['d', 'frame_id'])
+@pytest.mark.parametrize('fields, says', [(dict(d=np.zeros(100_000)), 'D has 100000'),
+                                          (dict(header='x' * 1000), 'frame_id has 1000 characters')],
+                         ids=['d', 'frame_id'])
 def test_what_would_be_kept_and_repeated_has_a_limit(info, new, fields, says):
     fields = {k: header(new, 1, v) if k == 'header' else v for k, v in fields.items()}
     check_lengths(info(), 'a')

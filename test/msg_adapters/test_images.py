@@ -15,7 +15,8 @@ from msg_adapters.messages import stamp_ns
 def image(encoding, rows, step, *, width, big=False, height=None):
     """Any object with the fields of sensor_msgs/Image; `rows` are bytes, padded to `step`."""
     data = b''.join(row + b'\xee' * (step - len(row)) for row in rows)
-    return SimpleNamespace(encoding=encoding, height=len(rows) if height is None else height, width=width, step=step, is_bigendian=int(big), data=data)
+    return SimpleNamespace(encoding=encoding, height=len(rows) if height is None else height, width=width, step=step,
+                           is_bigendian=int(big), data=data)
 
 
 @pytest.mark.parametrize('padding', [0, 1, 5])
@@ -77,7 +78,8 @@ def test_of_luminance_before_colour_the_luminance_is_taken(encoding, padding):
     msg = image(encoding, [*map(bytes, rows), bytes([77] * 4)], 4 + padding, width=4, height=2)
     assert image_to_array(msg).tolist() == rows
     msg.data = msg.data[:2 * msg.step]
-    with pytest.raises(BadImage, match=f'data has {2 * msg.step} bytes, but 3 rows of step {msg.step} need {3 * msg.step}'):
+    with pytest.raises(BadImage, match=f'data has {2 * msg.step} bytes, but 3 rows of step {msg.step} need '
+                                       f'{3 * msg.step}'):
         image_to_array(msg)
 
 
@@ -92,7 +94,8 @@ def test_the_last_row_may_come_without_its_padding():
     assert image_to_array(msg).tolist() == [[1, 2], [3, 4]]
 
 
-@pytest.mark.parametrize('data', [bytes(6), array.array('B', bytes(6)), np.zeros(6, np.uint8), memoryview(bytes(6))], ids=lambda d: type(d).__name__)
+@pytest.mark.parametrize('data', [bytes(6), array.array('B', bytes(6)), np.zeros(6, np.uint8), memoryview(bytes(6))],
+                         ids=lambda d: type(d).__name__)
 def test_does_not_copy_what_it_need_not(data):
     got = image_to_array(SimpleNamespace(encoding='mono8', height=2, width=3, step=3, is_bigendian=0, data=data))
     assert np.shares_memory(got, np.frombuffer(data, np.uint8))
@@ -126,7 +129,8 @@ def test_values_that_are_not_finite_are_refused(value):
         image_to_array(image('32FC1', [struct.pack('<2f', 1.0, value)], 8, width=2))
 
 
-@pytest.mark.parametrize('dtype, encoding', [(np.uint8, 'mono8'), (np.uint16, 'mono16'), (np.float32, '32FC1'), ('>u2', 'mono16'), ('>f4', '32FC1')])
+@pytest.mark.parametrize('dtype, encoding', [(np.uint8, 'mono8'), (np.uint16, 'mono16'), (np.float32, '32FC1'),
+                                             ('>u2', 'mono16'), ('>f4', '32FC1')])
 def test_there_and_back(new, dtype, encoding):
     pixels = (np.arange(12).reshape(3, 4) * 20).astype(dtype)
     msg = array_to_image(pixels[:, ::-1], 3_000_000_042, 'plane_a', new)   # not contiguous
@@ -141,7 +145,8 @@ def test_colour_is_written_as_bgr8(new):
     assert image_to_array(msg).tolist() == [[29] * 3] * 2
 
 
-@pytest.mark.parametrize('array', [np.zeros((2, 2)), np.zeros((2, 2, 4), np.uint8), np.zeros((0, 2), np.uint8), np.zeros(4, np.uint8), np.zeros((2, 2), bool)],
+@pytest.mark.parametrize('array', [np.zeros((2, 2)), np.zeros((2, 2, 4), np.uint8), np.zeros((0, 2), np.uint8),
+                                   np.zeros(4, np.uint8), np.zeros((2, 2), bool)],
                          ids=lambda a: f'{a.dtype}{a.shape}')
 def test_no_message_is_made_of_what_no_encoding_can_hold(array, new):
     with pytest.raises(BadImage, match='no image encoding'):
@@ -174,7 +179,8 @@ def test_compressed_colour_becomes_grey(new):
     assert got.tolist() == [[76] * 3] * 2
 
 
-@pytest.mark.parametrize('format_', ['png', 'mono16; png compressed mono16', '16UC1; png compressed ', 'mono16;png compressed', ''])
+@pytest.mark.parametrize('format_', ['png', 'mono16; png compressed mono16', '16UC1; png compressed ',
+                                     'mono16;png compressed', ''])
 def test_the_data_says_what_it_is_whatever_the_format_field_says(new, format_):
     pixels = np.array([[0, 256, 65535], [1, 4095, 4096]], np.uint16)
     got = compressed_to_array(compressed_message(new, cv2.imencode('.png', pixels)[1], format_))

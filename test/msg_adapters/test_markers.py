@@ -5,7 +5,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fluoro_shape_ros.data import Shape
-from msg_adapters.markers import LIFETIME_S, NAMES, SIDES, rejection_to_markers, shape_to_markers, sigma_colours, tube_mesh
+from msg_adapters.markers import (
+    LIFETIME_S,
+    NAMES,
+    SIDES,
+    rejection_to_markers,
+    shape_to_markers,
+    sigma_colours,
+    tube_mesh,
+)
 from msg_adapters.messages import stamp_ns
 
 ADD, DELETE = 0, 2
@@ -101,8 +109,10 @@ def test_an_unknown_covariance_is_no_ellipsoid_and_a_grey_tube(new):
 
 
 def test_what_is_shown_vanishes_when_the_stream_ends(new):
-    shown = [*shape_to_markers(arc(), RADIUS, 'ok', 1, 'cell', new).markers, *rejection_to_markers('no result', np.zeros(3), 7, 'cell', new).markers]
-    assert {(m.lifetime.sec, m.lifetime.nanosec) for m in shown if m.action == ADD} == {(LIFETIME_S, 0)} and 1 <= LIFETIME_S <= 5
+    shown = [*shape_to_markers(arc(), RADIUS, 'ok', 1, 'cell', new).markers,
+             *rejection_to_markers('no result', np.zeros(3), 7, 'cell', new).markers]
+    assert ({(m.lifetime.sec, m.lifetime.nanosec) for m in shown if m.action == ADD} == {(LIFETIME_S, 0)}
+            and 1 <= LIFETIME_S <= 5)
 
 
 @pytest.mark.parametrize('place, action', [(np.array([0.1, 0.2, 0.3]), ADD), (None, DELETE)])

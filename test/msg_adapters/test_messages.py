@@ -17,7 +17,8 @@ def test_header_and_stamp(new):
 
 def test_fields_that_are_not_given_have_their_default(new):
     msg = new('sensor_msgs/msg/CameraInfo')
-    assert (msg.width, msg.distortion_model, list(msg.d), list(msg.k), msg.roi.do_rectify, stamp_ns(msg)) == (0, '', [], [0.0] * 9, False, 0)
+    assert ((msg.width, msg.distortion_model, list(msg.d), list(msg.k), msg.roi.do_rectify, stamp_ns(msg))
+            == (0, '', [], [0.0] * 9, False, 0))
     assert new('nav_msgs/msg/Path').poses == []
 
 
@@ -45,10 +46,12 @@ def test_an_unknown_field_is_an_error(new):
 
 
 def test_ros_accepts_what_it_is_given():
-    """rclpy checks nothing when it makes a message; publishing would: its serialisation takes what the factory makes."""
+    """rclpy checks nothing when it makes a message; publishing would: its serialisation takes what the factory
+    makes."""
     pytest.importorskip('rclpy')
     from rclpy.serialization import deserialize_message, serialize_message
-    msg = ros_message('sensor_msgs/msg/Image', data=np.arange(200, dtype=np.uint8).reshape(10, 20), height=10, width=20, encoding='mono8', step=20)
+    msg = ros_message('sensor_msgs/msg/Image', data=np.arange(200, dtype=np.uint8).reshape(10, 20), height=10, width=20,
+                      encoding='mono8', step=20)
     again = deserialize_message(serialize_message(msg), type(msg))
     assert again == msg and list(again.data) == list(range(200))
     info = ros_message('sensor_msgs/msg/CameraInfo', k=np.eye(3), p=np.eye(3, 4), d=np.arange(4))
@@ -57,5 +60,6 @@ def test_ros_accepts_what_it_is_given():
 
 def test_the_adapters_need_no_ros():
     code = ('import sys\nfor name in ("rclpy", "sensor_msgs", "std_msgs"): sys.modules[name] = None\n'
-            'import msg_adapters.images, msg_adapters.cameras, msg_adapters.shapes, msg_adapters.calibration, msg_adapters.messages\n')
+            'import msg_adapters.images, msg_adapters.cameras, msg_adapters.shapes, msg_adapters.calibration, '
+            'msg_adapters.messages\n')
     subprocess.run([sys.executable, '-c', code], check=True, timeout=60)

@@ -1,6 +1,7 @@
 """Whatever a message says, it becomes what it says or is refused by name: properties over generated input.
 
-`PROPERTY_EXAMPLES=100000 pytest test/msg_adapters/test_properties.py` tries that many for each; the default keeps CI short, and always the same.
+`PROPERTY_EXAMPLES=100000 pytest test/msg_adapters/test_properties.py` tries that many for each; the default keeps CI
+short, and always the same.
 """
 
 import struct
@@ -43,7 +44,8 @@ def images(draw):
     step = max(0, width * e.dtype.itemsize * e.channels + draw(st.sampled_from([0, 0, 1, 3, -1])))
     size = max(0, height * step + draw(st.sampled_from([0, 0, 0, -1, -3, 1, 1000])))
     data = draw(st.binary(min_size=size, max_size=size))
-    fields = dict(encoding=encoding, height=height, width=width, step=step, is_bigendian=draw(st.integers(0, 255)), data=data)
+    fields = dict(encoding=encoding, height=height, width=width, step=step, is_bigendian=draw(st.integers(0, 255)),
+                  data=data)
     lie = draw(st.sampled_from([None] * 6 + ['height', 'width', 'step']))
     return SimpleNamespace(**fields | ({lie: draw(UINT32)} if lie else {}))
 
@@ -51,13 +53,16 @@ def images(draw):
 def by_hand(msg):
     """The channels of every pixel, read one by one; None where the message can't be an image."""
     e = ENCODINGS.get(msg.encoding)
-    if e is None or not msg.height or not msg.width or (e.channels == 2 and msg.width % 2):      # two pixels share their colour
+    # two pixels share their colour
+    if e is None or not msg.height or not msg.width or (e.channels == 2 and msg.width % 2):
         return None
     item = e.dtype.itemsize * e.channels
-    if msg.step < msg.width * item or not (msg.height - 1) * msg.step + msg.width * item <= len(msg.data) <= msg.height * msg.step:
+    if (msg.step < msg.width * item
+            or not (msg.height - 1) * msg.step + msg.width * item <= len(msg.data) <= msg.height * msg.step):
         return None
     form = ('>' if msg.is_bigendian else '<') + str(e.channels) + FORMATS[e.dtype.itemsize]
-    pixels = np.array([[struct.unpack_from(form, msg.data, v * msg.step + u * item) for u in range(msg.width)] for v in range(msg.height)])
+    pixels = np.array([[struct.unpack_from(form, msg.data, v * msg.step + u * item) for u in range(msg.width)]
+                       for v in range(msg.height)])
     return pixels if np.isfinite(pixels).all() else None
 
 
@@ -109,7 +114,8 @@ def projection(angle, distance=0.8):
 
 
 def info(**fields):
-    values = dict(header=SimpleNamespace(frame_id='plane'), height=64, width=64, distortion_model='plumb_bob', d=[0.0] * 5, k=K.ravel().tolist(),
+    values = dict(header=SimpleNamespace(frame_id='plane'), height=64, width=64, distortion_model='plumb_bob',
+                  d=[0.0] * 5, k=K.ravel().tolist(),
                   r=np.eye(3).ravel().tolist(), p=projection(0.0).ravel().tolist(), binning_x=0, binning_y=0,
                   roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0))
     return SimpleNamespace(**values | fields)
@@ -143,20 +149,25 @@ def test_a_camera_info_is_a_camera_or_refused(msg, rectified):
     except BadCameraInfo as error:
         assert str(error)
         return
-    assert np.isfinite(view.P).all() and np.isclose(np.linalg.norm(view.P[2, :3]), 1.0) and (view.width, view.height) == (64, 64)
+    assert (np.isfinite(view.P).all() and np.isclose(np.linalg.norm(view.P[2, :3]), 1.0)
+            and (view.width, view.height) == (64, 64))
     assert camera(msg) == camera(msg) and hash(camera(msg)) == hash(camera(msg))
 
 
 LINE = cv2.GaussianBlur(cv2.line(np.full((64, 64), 180, np.uint8), (31, 0), (33, 40), 60, 2), (3, 3), 0)
 GREYS = st.one_of(
-    st.just(LINE), st.just((LINE * 257.0).astype(np.uint16)), st.just(-LINE.astype(np.float32)), st.just(LINE.astype(np.float32) * np.float32(1e36)),
-    st.floats(width=32, allow_nan=False, allow_infinity=False).map(lambda v: np.where(LINE < 150, v, 1).astype(np.float32)),
+    st.just(LINE), st.just((LINE * 257.0).astype(np.uint16)), st.just(-LINE.astype(np.float32)),
+    st.just(LINE.astype(np.float32) * np.float32(1e36)),
+    st.floats(width=32, allow_nan=False,
+              allow_infinity=False).map(lambda v: np.where(LINE < 150, v, 1).astype(np.float32)),
     st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).integers(0, 256, (64, 64), np.uint8)))
 
 
 @examples(2)
-@example(info(), info(p=projection(np.pi / 2, 0.0).ravel().tolist()), LINE, LINE, 'paper', 'dark')      # its source lies where the planes look
-@given(camera_infos(), camera_infos(projection(np.pi / 2)), GREYS, GREYS, st.sampled_from(['spline', 'paper']), st.sampled_from(['dark', 'bright', 'auto']))
+# its source lies where the planes look
+@example(info(), info(p=projection(np.pi / 2, 0.0).ravel().tolist()), LINE, LINE, 'paper', 'dark')
+@given(camera_infos(), camera_infos(projection(np.pi / 2)), GREYS, GREYS, st.sampled_from(['spline', 'paper']),
+       st.sampled_from(['dark', 'bright', 'auto']))
 def test_a_pair_that_is_accepted_is_answered(info_a, info_b, image_a, image_b, method, polarity):
     """No arithmetic on absurd but acceptable cameras and pixels ends in anything but an outcome."""
     try:
@@ -169,17 +180,20 @@ def test_a_pair_that_is_accepted_is_answered(info_a, info_b, image_a, image_b, m
 
 
 @examples()
-@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1), st.sampled_from([np.uint8, np.uint16, np.float32]))
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1),
+       st.sampled_from([np.uint8, np.uint16, np.float32]))
 def test_an_image_of_any_size_is_answered(height, width, seed, dtype):
     image = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(dtype)
-    views = tuple(camera_info_to_view(info(height=height, width=width, p=projection(a).ravel()), p, image.shape) for p, a in zip('ab', (0, np.pi / 2)))
+    views = tuple(camera_info_to_view(info(height=height, width=width, p=projection(a).ravel()), p, image.shape)
+                  for p, a in zip('ab', (0, np.pi / 2)))
     assert isinstance(reconstruct(Frame(1, 'cell', (image, image), views), Config()).outcome, Outcome)
 
 
 @examples()
 @given(st.floats(0, np.pi), st.floats(-1e-4, 1e-4), st.sampled_from([0.0, 1e-6]))
 def test_planes_that_coincide_are_named(angle, turn, shift):
-    views = [camera_info_to_view(info(p=(projection(a) + shift).ravel()), p, (64, 64)) for p, a in zip('ab', (angle, angle + turn))]
+    views = [camera_info_to_view(info(p=(projection(a) + shift).ravel()), p, (64, 64))
+             for p, a in zip('ab', (angle, angle + turn))]
     with pytest.raises(GeometryError, match='coincide|parallel'):
         check_pair(views)
 

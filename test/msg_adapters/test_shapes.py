@@ -84,7 +84,8 @@ def test_backwards_along_x_is_half_a_turn():
 
 
 def test_the_frame_never_turns_about_the_backbone():
-    """Rotation-minimising: the angular velocity has no component along the tangent, also where curvature comes with torsion."""
+    """Rotation-minimising: the angular velocity has no component along the tangent, also where curvature comes with
+    torsion."""
     turns = Rotation.from_quat(orientations(helix()))
     step = (turns[1:] * turns[:-1].inv()).as_rotvec()
     middle = tangents(helix())[:-1] + tangents(helix())[1:]
@@ -105,12 +106,14 @@ def test_doubling_agrees_with_one_by_one():
 
 def test_tangents_of_uneven_steps():
     a = np.array([0, 0.1, 0.15, 0.3, 0.5])
-    assert_allclose(tangents(shape(np.c_[np.cos(a), np.sin(a), 0 * a], a)), np.c_[-np.sin(a), np.cos(a), 0 * a], atol=0.02)
+    assert_allclose(tangents(shape(np.c_[np.cos(a), np.sin(a), 0 * a], a)), np.c_[-np.sin(a), np.cos(a), 0 * a],
+                    atol=0.02)
 
 
 @pytest.mark.parametrize('n', [1, 2, 3])
 def test_the_shortest_shapes(n):
-    assert_allclose(axes(straight([0, 1, 0], n))[:, :, 0], np.tile([1.0, 0, 0] if n == 1 else [0, 1.0, 0], (n, 1)), atol=1e-12)
+    assert_allclose(axes(straight([0, 1, 0], n))[:, :, 0], np.tile([1.0, 0, 0] if n == 1 else [0, 1.0, 0], (n, 1)),
+                    atol=1e-12)
 
 
 def test_path(new):
@@ -118,14 +121,17 @@ def test_path(new):
     msg = shape_to_path(case, STAMP, FRAME, new)
     assert (stamp_ns(msg), msg.header.frame_id, len(msg.poses)) == (STAMP, FRAME, 80)
     assert {(stamp_ns(p), p.header.frame_id) for p in msg.poses} == {(STAMP, FRAME)}
-    assert_allclose([[p.pose.orientation.x, p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w] for p in msg.poses], orientations(case))
+    assert_allclose([[p.pose.orientation.x, p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w]
+                     for p in msg.poses], orientations(case))
     assert_allclose(path_to_points(msg), case.points)
 
 
 def test_tip_is_the_last_pose(new):
-    path, tip, pose = (adapter(arc(), STAMP, FRAME, new) for adapter in (shape_to_path, shape_to_tip, shape_to_tip_pose))
+    path, tip, pose = (adapter(arc(), STAMP, FRAME, new)
+                       for adapter in (shape_to_path, shape_to_tip, shape_to_tip_pose))
     last = path.poses[-1].pose
-    assert [tip.point.x, tip.point.y, tip.point.z] == [last.position.x, last.position.y, last.position.z] == arc().tip.tolist()
+    assert ([tip.point.x, tip.point.y, tip.point.z] == [last.position.x, last.position.y, last.position.z]
+            == arc().tip.tolist())
     assert pose.pose.pose.position.x == last.position.x and pose.pose.pose.orientation.z == last.orientation.z
     assert stamp_ns(tip) == stamp_ns(pose) == STAMP
     assert tip.header.frame_id == pose.header.frame_id == FRAME
@@ -133,7 +139,8 @@ def test_tip_is_the_last_pose(new):
 
 
 def test_covariance_of_a_tip_that_points_along_z():
-    # sigma 0.1 mm at both ends of a 10 mm chord: 2 (s^2 + s^2) / L^2 = 4e-4 rad^2 about x and y; about z nothing is known
+    # sigma 0.1 mm at both ends of a 10 mm chord: 2 (s^2 + s^2) / L^2 = 4e-4 rad^2 about x and y;
+    # about z nothing is known
     points = np.arange(41)[:, None] * 0.001 * [0, 0, 1.0]
     expected = np.diag([1e-8, 1e-8, 1e-8, 4e-4, 4e-4, ANY_ANGLE_VARIANCE])
     assert_allclose(tip_covariance(shape(points, variance=1e-8)), expected, atol=1e-15)
@@ -156,9 +163,11 @@ def test_cloud(new):
     covariance[1] = np.nan
     residuals = np.arange(10.0).reshape(5, 2)
     msg = shape_to_cloud(Shape(case.points, case.s, covariance, residuals), 0.998, STAMP, FRAME, new)
-    assert (stamp_ns(msg), msg.header.frame_id, msg.height, msg.width, msg.row_step) == (STAMP, FRAME, 1, 5, 5 * msg.point_step)
+    assert (stamp_ns(msg), msg.header.frame_id, msg.height, msg.width, msg.row_step) == (STAMP, FRAME, 1, 5,
+                                                                                         5 * msg.point_step)
     assert {f.datatype for f in msg.fields} == {7} and {f.count for f in msg.fields} == {1}
-    layout = np.dtype({'names': [f.name for f in msg.fields], 'formats': ['>f4' if msg.is_bigendian else '<f4'] * len(msg.fields),
+    layout = np.dtype({'names': [f.name for f in msg.fields],
+                       'formats': ['>f4' if msg.is_bigendian else '<f4'] * len(msg.fields),
                        'offsets': [f.offset for f in msg.fields], 'itemsize': msg.point_step})
     cloud = np.frombuffer(msg.data, layout)
     assert list(cloud.dtype.names) == ['x', 'y', 'z', 's', 'sigma', 'residual_a_px', 'residual_b_px', 'confidence']
@@ -178,7 +187,9 @@ def test_a_cloud_is_dense_where_all_is_known(new, confidence, dense):
 
 
 def path(new, points):
-    poses = [new('geometry_msgs/msg/PoseStamped', pose=new('geometry_msgs/msg/Pose', position=new('geometry_msgs/msg/Point', x=x, y=y, z=z))) for x, y, z in points]
+    poses = [new('geometry_msgs/msg/PoseStamped',
+                 pose=new('geometry_msgs/msg/Pose', position=new('geometry_msgs/msg/Point', x=x, y=y, z=z)))
+             for x, y, z in points]
     return new('nav_msgs/msg/Path', poses=poses)
 
 
@@ -189,7 +200,8 @@ def test_points_of_a_path(new):
 @pytest.mark.parametrize('points, says', [
     ([], '0 poses'),
     ([(0.0, 0.0, 0.0)], '1 poses'),
-    ([(0.0, 0.0, 0.0), (0.0, float('nan'), 0.0), (float('inf'), 0.0, 0.0)], '2 of 3 positions are not finite, the first is pose 1'),
+    ([(0.0, 0.0, 0.0), (0.0, float('nan'), 0.0), (float('inf'), 0.0, 0.0)],
+     '2 of 3 positions are not finite, the first is pose 1'),
 ])
 def test_a_bad_path_is_named(new, points, says):
     with pytest.raises(BadPath, match=says):
@@ -203,7 +215,8 @@ def test_an_endless_path_is_refused(new):
         path_to_points(msg)
 
 
-@pytest.mark.parametrize('frame_id', ['', 'cell', 'plane_a', 'isocenter', 'plane_a_optical', 'r\u00f6ntgen'])      # all alignments
+# all alignments
+@pytest.mark.parametrize('frame_id', ['', 'cell', 'plane_a', 'isocenter', 'plane_a_optical', 'r\u00f6ntgen'])
 @pytest.mark.parametrize('n', [1, 2, 30])
 def test_a_path_is_serialised_as_ros_does_it(frame_id, n):
     serialization = pytest.importorskip('rclpy.serialization')

@@ -1,4 +1,5 @@
-"""Whether the calibrations of both planes belong together: places that both planes see against one another's epipolar lines."""
+"""Whether the calibrations of both planes belong together: places that both planes see against one another's epipolar
+lines."""
 
 import dataclasses
 import json
@@ -14,7 +15,8 @@ from fluoro_shape_ros.data import Landmarks
 from fluoro_shape_ros.geometry.cameras import make_view, project
 from fluoro_shape_ros.ros.calibration_watch import WRONG, CalibrationWatch, Finding, observed
 
-A, B = (make_view(name, P, SIZE, SIZE) for name, P in zip('ab', VIEWS))     # 1 px is 1 mm at the isocentre, v runs along the common axis
+# 1 px is 1 mm at the isocentre, v runs along the common axis
+A, B = (make_view(name, P, SIZE, SIZE) for name, P in zip('ab', VIEWS))
 NOISE_PX = 0.3
 TURN = np.deg2rad(2)
 NUMBER = re.compile(r'(\d+\.\d)')
@@ -22,9 +24,11 @@ SEES_IT = 1.5           # px, that plane B of the drawn pairs is off by
 
 
 def seen(X, kinds, rng=None, bias=(0.0, 0.0)):
-    """What the true planes show of (N, 3) points, of a device that runs along v: its ends, known to NOISE_PX along it and off by a `bias` in plane B."""
+    """What the true planes show of (N, 3) points, of a device that runs along v: its ends, known to NOISE_PX along it
+    and off by a `bias` in plane B."""
     along = np.array([[0.0, -1.0 if kind == 'tip' else 1.0] for kind in kinds]).reshape(-1, 2)
-    off = np.array([bias[int(kind == 'base')] for kind in kinds]) + (0.0 if rng is None else rng.normal(0, NOISE_PX, len(kinds)))
+    off = (np.array([bias[int(kind == 'base')] for kind in kinds])
+           + (0.0 if rng is None else rng.normal(0, NOISE_PX, len(kinds))))
     return Landmarks(kinds, project(A.P, X), project(B.P, X) + along * off[:, None], NOISE_PX * along)
 
 
@@ -33,7 +37,8 @@ def result(landmarks, confidence=0.999):
 
 
 def run(views, pairs, seed=0, wrong=0.0, bias=0.0, watch=None, cameras=None):
-    """What is found over so many pairs of a device whose ends wander about; some share of the ends was found at a wrong place."""
+    """What is found over so many pairs of a device whose ends wander about; some share of the ends was found at a wrong
+    place."""
     watch, rng = watch or CalibrationWatch(), np.random.default_rng(seed)
     biases, phase, pace = rng.normal(0, bias, 2), rng.uniform(0, 6, (2, 3)), rng.uniform(0.05, 0.15, (2, 3))
     for k in range(pairs):
@@ -80,7 +85,8 @@ def test_each_error_acts_as_its_column_says(X, k, small, views):
 def test_what_is_wrong_is_noticed_measured_and_named(views, words):
     found = run(views, 60)
     expected, told = (NUMBER.split(text) for text in (words, found.looks_like))
-    assert found.noticed and told[::2] == expected[::2] and all(abs(float(t) - float(e)) < 0.4 for t, e in zip(told[1::2], expected[1::2]))
+    assert (found.noticed and told[::2] == expected[::2]
+            and all(abs(float(t) - float(e)) < 0.4 for t, e in zip(told[1::2], expected[1::2])))
     assert str(found).startswith(f'the planes disagree by {found.apart_px:.1f} px +- 0.')
     assert str(found).endswith(f' across the epipolar lines over 60 pairs, {found.looks_like}: check the calibration')
 
@@ -94,7 +100,8 @@ def test_right_calibrations_are_not_cried_about():
     found = [run((A, B), 100, seed, bias=0.5 * NOISE_PX, wrong=0.05) for seed in range(12)]
     assert not any(f.noticed for f in found) and all(f.pairs == 100 and 'nothing noticed' in str(f) for f in found)
     assert np.median([f.apart_px for f in found]) < 0.2
-    assert run((A, misplaced(B, (0, 1.0))), 100, bias=0.5 * NOISE_PX, wrong=0.05).noticed     # with the same that is astray
+    # with the same that is astray
+    assert run((A, misplaced(B, (0, 1.0))), 100, bias=0.5 * NOISE_PX, wrong=0.05).noticed
 
 
 def test_a_shift_along_the_epipolar_lines_shows_nothing():
@@ -126,7 +133,8 @@ def test_it_recovers_when_the_planes_agree_again():
     assert not run((A, B), 1000, seed=1, watch=watch).noticed
 
 
-@pytest.mark.parametrize('given', [result(None), result(seen(np.zeros((0, 3)), ())), result(seen(np.zeros((1, 3)), ('tip',)), 0.2),
+@pytest.mark.parametrize('given', [result(None), result(seen(np.zeros((0, 3)), ())),
+                                   result(seen(np.zeros((1, 3)), ('tip',)), 0.2),
                                    result(seen(np.zeros((1, 3)), ('tip',)), float('nan'))])
 def test_pairs_without_landmarks_and_curves_that_are_rather_wrong_do_not_count(given):
     watch = CalibrationWatch()
@@ -144,13 +152,15 @@ def test_errors_of_the_bench_are_what_they_are_called():
     np.testing.assert_allclose(px['shifted along u by 0.5 px'], (u + 0.5, v))
     np.testing.assert_allclose(px['scaled by 2 %'] - middle, 1.02 * np.array([u - middle, v - middle]))
     c, s = np.cos(TURN), np.sin(TURN)
-    np.testing.assert_allclose(px['turned by 2 degrees'] - middle, [c * (u - middle) - s * (v - middle), s * (u - middle) + c * (v - middle)])
+    np.testing.assert_allclose(px['turned by 2 degrees'] - middle,
+                               [c * (u - middle) - s * (v - middle), s * (u - middle) + c * (v - middle)])
     np.testing.assert_allclose(px['exchanged'], project(A.P, X)[0])
 
 
 def test_the_table_of_the_bench():
     exchanged = Finding(24, True, 3.0, 0.3, 'and would agree if the calibrations were exchanged')
-    runs = [[Watched('none', 24, None, Finding(24)), Watched('exchanged', answered, after, exchanged)] for answered, after in ((24, 5), (12, 15))]
+    runs = [[Watched('none', 24, None, Finding(24)), Watched('exchanged', answered, after, exchanged)]
+            for answered, after in ((24, 5), (12, 15))]
     _, right, wrong, *_ = report(runs, 24).splitlines()
     assert right.split() == ['none', '0', 'of', '2', '100', '%']
     assert wrong.split() == ['exchanged', '2', 'of', '2', '10', '75', '%', '3.0', '2', 'exchanged']
@@ -166,10 +176,13 @@ def test_a_replay_says_it_in_the_terminal_and_for_programs(tmp_path, capsys, mon
     for name, calibrations, noticed in (('right', CALIBRATIONS, False), ('wrong', spoiled, True)):
         monkeypatch.setattr(recording, 'CALIBRATIONS', calibrations)
         recording.record(tmp_path / name, [GOOD] * 12)
-        assert recording.main(tmp_path / name, '--out', tmp_path / f'{name}_out', '--json', tmp_path / f'{name}.json', '-p', BASE, '-p', 'reference_frame=cell') == 0
+        assert recording.main(tmp_path / name, '--out', tmp_path / f'{name}_out', '--json', tmp_path / f'{name}.json',
+                              '-p', BASE, '-p', 'reference_frame=cell') == 0
         said = json.loads((tmp_path / f'{name}.json').read_text())['calibration_watch']
-        assert said['noticed'] is noticed and said['pairs'] == 12 and f'calibration watch: {said["words"]}\n' in capsys.readouterr().out
-    assert said['apart_px'] == pytest.approx(SEES_IT, abs=0.3) and said['looks_like'].startswith('as if one were shifted')
+        assert (said['noticed'] is noticed and said['pairs'] == 12
+                and f'calibration watch: {said["words"]}\n' in capsys.readouterr().out)
+    assert (said['apart_px'] == pytest.approx(SEES_IT, abs=0.3)
+            and said['looks_like'].startswith('as if one were shifted'))
 
 
 def test_the_node_says_it_in_diagnostics_and_forgets_it_when_reset(tmp_path_factory):
@@ -178,7 +191,8 @@ def test_the_node_says_it_in_diagnostics_and_forgets_it_when_reset(tmp_path_fact
     wrong = [ros.VIEWS[0], misplaced(make_view('b', ros.VIEWS[1], ros.SIZE, ros.SIZE), (0, SEES_IT)).P]
     with ros.answered(tmp_path_factory, ros.BASE, ros.RADIUS, 'reference_frame:=cell') as (node, client):
         assert client.value('reconstruction', 'calibration_watch').startswith('too little seen yet to tell')
-        said = lambda: any('the planes disagree by' in s.message and s.level == b'\x01' for s in client.statuses)  # noqa: E731
+        said = lambda: any('the planes disagree by' in s.message and s.level == b'\x01'    # noqa: E731
+                           for s in client.statuses)
         assert client.insist(said, every=0.5, infos=[ros.info_msg(P) for P in wrong]), node.log
         assert client.value('reconstruction', 'calibration_watch').startswith('the planes disagree by')
         assert client.until(lambda: 'the planes disagree by' in node.log)

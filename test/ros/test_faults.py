@@ -1,4 +1,5 @@
-"""The fault table (docs/faults.md) on real topics: what diagnostics say, and that the second good pair afterwards gives a good result.
+"""The fault table (docs/faults.md) on real topics: what diagnostics say, and that the second good pair afterwards gives
+a good result.
 
 All rows go through one node, one after the other; what a row leaves behind is the next one's trouble.
 """
@@ -48,7 +49,8 @@ def second_good_pair(client):
 def right(client, stamp):
     """The pair of this stamp gets an answer, and that is right."""
     answer = client.answer(stamp, LIMIT)
-    assert answer is not None, '\n'.join(f'{s.name}: {s.message} {[(v.key, v.value) for v in s.values]}' for s in client.statuses[-4:])
+    assert answer is not None, '\n'.join(f'{s.name}: {s.message} {[(v.key, v.value) for v in s.values]}'
+                                         for s in client.statuses[-4:])
     path, tip = answer
     X = points(path)
     assert np.linalg.norm(X[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < TOLERANCE
@@ -58,7 +60,8 @@ def right(client, stamp):
 
 def says(client, name, *words):
     """Whether the status `name` comes to have these words."""
-    found = lambda: any(s.name.endswith(name) and all(w in s.message for w in words) for s in client.statuses)  # noqa: E731
+    found = lambda: any(s.name.endswith(name) and all(w in s.message for w in words)    # noqa: E731
+                        for s in client.statuses)
     del client.statuses[:]
     return client.until(found, LIMIT)
 
@@ -111,19 +114,24 @@ def test_camera_infos_that_no_longer_come_hold_after_a_while(client):
 def test_a_camera_that_moves_is_never_mixed_up_with_the_one_before(client):
     for angle in (10, 20, 30):
         views = [ros.projection(angle), ros.projection(angle + 90)]
-        right(client, client.send_pixels([ros.draw(P) for P in views], infos=[info_msg(P) for P in views], infos_last=angle == 20))
+        right(client, client.send_pixels([ros.draw(P) for P in views], infos=[info_msg(P) for P in views],
+                                         infos_last=angle == 20))
 
 
 def test_a_camera_info_that_contradicts_the_image_size(client):
     stamp = client.send_pixels(GOOD, infos=[info_msg(VIEWS[0], height=SIZE + 1), info_msg(VIEWS[1])])
-    assert says(client, 'reconstruction', 'bad_camera_info', 'plane a', f'{SIZE}x{SIZE + 1}') and stamp not in client.paths
+    assert (says(client, 'reconstruction', 'bad_camera_info', 'plane a', f'{SIZE}x{SIZE + 1}')
+            and stamp not in client.paths)
 
 
 def test_images_of_changing_size_and_encoding(client):
-    deep = [image_msg(pixels, encoding='mono16', step=2 * SIZE, data=ros.bytes_of((pixels * np.uint16(257)).tobytes())) for pixels in GOOD]
-    real = [image_msg(pixels, encoding='32FC1', step=4 * SIZE, data=ros.bytes_of(pixels.astype(np.float32).tobytes())) for pixels in GOOD]
+    deep = [image_msg(pixels, encoding='mono16', step=2 * SIZE, data=ros.bytes_of((pixels * np.uint16(257)).tobytes()))
+            for pixels in GOOD]
+    real = [image_msg(pixels, encoding='32FC1', step=4 * SIZE, data=ros.bytes_of(pixels.astype(np.float32).tobytes()))
+            for pixels in GOOD]
     small = [ros.projection(0, 256), ros.projection(90, 256)]
-    for pair, infos in ((deep, None), (real, None), ([image_msg(ros.draw(P, 256)) for P in small], [info_msg(P, 256) for P in small]), ([deep[0], real[1]], None)):
+    for pair, infos in ((deep, None), (real, None), ([image_msg(ros.draw(P, 256)) for P in small],
+                                                     [info_msg(P, 256) for P in small]), ([deep[0], real[1]], None)):
         right(client, client.send(pair, infos=infos))
 
 
@@ -173,10 +181,12 @@ def test_two_publishers_on_one_topic(client):
         for _ in range(3):
             stamp = client.send_pixels(GOOD)
             other.now_ns = client.now_ns - STEP_NS
-            other.send_pixels([pixels[::-1].copy() for pixels in GOOD])     # the same stamps, another picture; which comes first is open
+            # the same stamps, another picture; which comes first is open
+            other.send_pixels([pixels[::-1].copy() for pixels in GOOD])
         assert client.answer(stamp, LIMIT)
         del client.statuses[:]
-        assert client.insist(lambda: any(s.name.endswith('plane a') and '2 publishers' in s.message for s in client.statuses))     # said while images come
+        assert client.insist(lambda: any(s.name.endswith('plane a') and '2 publishers' in s.message
+                                         for s in client.statuses))     # said while images come
         assert count(client, 'pairing', 'duplicates') >= 2
 
 
@@ -186,27 +196,31 @@ def test_simulated_time_without_and_with_a_clock(client):
     right(client, client.send_pixels(GOOD))
     clock = client.node.create_publisher(Clock, '/clock', 1)
     del client.statuses[:]
-    told = lambda: clock.publish(Clock(clock=ros.time_msg(77 * SECOND))) or any(w in s.message for s in client.statuses for w in ('results/s', 'results are labelled'))     # noqa: E731
+    told = lambda: (clock.publish(Clock(clock=ros.time_msg(77 * SECOND)))    # noqa: E731
+                    or any(w in s.message for s in client.statuses for w in ('results/s', 'results are labelled')))
     assert client.insist(told), [s.message for s in client.statuses][-8:]
     client.node.destroy_publisher(clock)
     assert client.set('use_sim_time', False).successful
 
 
-@pytest.mark.parametrize('reliability', [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT], ids=lambda r: r.name)
+@pytest.mark.parametrize('reliability', [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT],
+                         ids=lambda r: r.name)
 def test_transient_local_publishers(client, reliability):
     with Client(reliability, start_ns=client.now_ns, durability=DurabilityPolicy.TRANSIENT_LOCAL) as other:
         assert other.connected()
         assert other.good()
         assert other.value('plane a', 'reliability') == reliability.name.lower()
         client.now_ns = other.now_ns
-    for value in ('reliable', 'auto'):      # what is taken for one publisher's sake holds while any is left; this is how to go back
+    # what is taken for one publisher's sake holds while any is left; this is how to go back
+    for value in ('reliable', 'auto'):
         assert client.set('image_reliability', value).successful
     assert client.connected() and client.value('plane a', 'reliability') == 'reliable'
 
 
 def child(code):
     """A process that runs `code` beside the tests."""
-    env = {**os.environ, 'ROS_DOMAIN_ID': str(ros.DOMAIN), 'PYTHONPATH': os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH', '')])}
+    env = {**os.environ, 'ROS_DOMAIN_ID': str(ros.DOMAIN),
+           'PYTHONPATH': os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH', '')])}
     return subprocess.Popen([sys.executable, '-c', code], env=env, stdout=subprocess.PIPE, text=True)
 
 
@@ -224,7 +238,8 @@ def test_a_subscriber_that_stalls(client):
         from rclpy.qos import HistoryPolicy, QoSProfile
         rclpy.init()
         node = rclpy.create_node('sleeper')
-        keep = node.create_subscription(Path, 'backbone', lambda m: print('heard', flush=True), QoSProfile(history=HistoryPolicy.KEEP_ALL))
+        keep = node.create_subscription(Path, 'backbone', lambda m: print('heard', flush=True),
+                                        QoSProfile(history=HistoryPolicy.KEEP_ALL))
         rclpy.spin(node)''')
     try:
         assert client.insist(lambda: client.node.count_subscribers('backbone') == 2)
@@ -258,14 +273,15 @@ def test_parameters_changed_all_the_time(client):
     assert service.wait_for_service(LIMIT)
     futures = []
     for k in range(100):
-        changes = [Parameter('backbone_spacing', value=0.001 + 1e-5 * (k % 7)), Parameter('image_transport', value='raw'),
-                   Parameter('sync_slop', value=0.01 if k % 2 else 5.0)]
+        changes = [Parameter('backbone_spacing', value=0.001 + 1e-5 * (k % 7)),
+                   Parameter('image_transport', value='raw'), Parameter('sync_slop', value=0.01 if k % 2 else 5.0)]
         futures.append(service.call_async(SetParameters.Request(parameters=[c.to_parameter_msg() for c in changes])))
         if k % 5 == 0:
             client.send_pixels(GOOD)
         assert client.until(lambda: sum(not f.done() for f in futures) < 5, LIMIT)      # a service's queue holds ten
     assert client.until(lambda: all(f.done() for f in futures), LIMIT)
-    assert [[r.successful for r in f.result().results] for f in futures] == [[True, True, k % 2 == 1] for k in range(100)]
+    assert [[r.successful for r in f.result().results] for f in futures] == [[True, True, k % 2 == 1]
+                                                                             for k in range(100)]
     client.node.destroy_client(service)
     assert client.set('backbone_spacing', 0.001).successful
 

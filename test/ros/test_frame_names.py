@@ -1,4 +1,5 @@
-"""Frames whose names contradict: said by the node, the replay and the importer, and never where all is as it should be."""
+"""Frames whose names contradict: said by the node, the replay and the importer, and never where all is as it should
+be."""
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from msg_adapters.cameras import has_pose
 from msg_adapters.messages import bag_message
 
 FRAMES = 'plane_a_optical', 'plane_b_optical'
-POSED = 'results are labelled "plane_a_optical", but P of plane A has a pose, so that they lie in another frame: name it by reference_frame'
+POSED = ('results are labelled "plane_a_optical", but P of plane A has a pose, so that they lie in another frame: '
+         'name it by reference_frame')
 TURNED = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
@@ -50,10 +52,13 @@ def test_a_pose_in_p(new, P, posed):
     (dict(reference_frame='isocenter'), None, FRAMES, FRAMES, []),
     (dict(geometry='tf'), None, FRAMES, FRAMES, []),
     (dict(reference_frame='cell'), None, ('plane_a_optical', 'lateral'), FRAMES,
-     ['plane B: its images are of frame "lateral", its camera info of "plane_b_optical": are the calibrations exchanged?']),
+     ['plane B: its images are of frame "lateral", its camera info of "plane_b_optical": '
+      'are the calibrations exchanged?']),
     (dict(reference_frame='cell'), None, ('', ''), FRAMES, []),
-    (dict(reference_frame='cell'), None, FRAMES[::-1], FRAMES[::-1], ['frame_id "plane_b_optical" was given for plane A: are the planes exchanged?']),
-    (dict(reference_frame='cell'), None, FRAMES[::-1], ('', ''), ['frame_id "plane_b_optical" was given for plane A: are the planes exchanged?']),
+    (dict(reference_frame='cell'), None, FRAMES[::-1], FRAMES[::-1],
+     ['frame_id "plane_b_optical" was given for plane A: are the planes exchanged?']),
+    (dict(reference_frame='cell'), None, FRAMES[::-1], ('', ''),
+     ['frame_id "plane_b_optical" was given for plane A: are the planes exchanged?']),
     (dict(reference_frame='cell'), None, ('frontal', 'lateral'), ('frontal', 'lateral'), []),
 ])
 def test_what_contradicts(new, given, P, images, infos, said):
@@ -68,7 +73,8 @@ def test_cameras_that_are_not_there_contradict_nothing():
 @pytest.mark.parametrize('frame', [None, 'cell'])
 def test_a_replay_says_it_in_the_terminal_and_in_its_bag(tmp_path, capsys, frame):
     record(tmp_path / 'run', [GOOD])
-    assert main(tmp_path / 'run', '--out', tmp_path / 'out', *(['-p', f'reference_frame={frame}'] if frame else [])) == 0
+    assert main(tmp_path / 'run', '--out', tmp_path / 'out',
+                *(['-p', f'reference_frame={frame}'] if frame else [])) == 0
     assert (POSED in capsys.readouterr().out) is (frame is None)
     status = read(tmp_path / 'out')['/diagnostics'][0][1].status[0]
     assert (POSED in status.message) is (frame is None) and (frame or status.level == 1)
@@ -80,21 +86,24 @@ def test_the_importer_prints_a_command_that_names_a_frame(tmp_path, capsys, monk
     for plane, P, pixels in zip('ab', VIEWS, GOOD):
         cv2.imwrite(f'{plane}.png', pixels)
         rows = ', '.join(f'{x:.9g}' for x in P.ravel())
-        (tmp_path / f'{plane}.yaml').write_text(f'image_width: 320\nimage_height: 320\ncamera_name: plane_{plane}\ndistortion_model: plumb_bob\n'
-                                                f'camera_matrix: {{rows: 3, cols: 3, data: [{", ".join(map(str, K.ravel()))}]}}\n'
+        (tmp_path / f'{plane}.yaml').write_text(f'image_width: 320\nimage_height: 320\ncamera_name: plane_{plane}\n'
+                                                'distortion_model: plumb_bob\ncamera_matrix: {rows: '
+                                                f'3, cols: 3, data: [{", ".join(map(str, K.ravel()))}]}}\n'
                                                 'distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n'
                                                 f'projection_matrix: {{rows: 3, cols: 4, data: [{rows}]}}\n')
     given = [word for p in 'ab' for word in (f'--plane-{p}', f'{p}.png', f'--camera-{p}', f'{p}.yaml')]
     assert importer.main([*given, '--rate', '15', '--out', 'run']) == 0
     said = capsys.readouterr()
-    assert said.out == '1 pairs in run\n' and 'fluoro_shape_replay run --out results -p reference_frame=isocenter' in said.err
+    assert (said.out == '1 pairs in run\n'
+            and 'fluoro_shape_replay run --out results -p reference_frame=isocenter' in said.err)
 
 
 def test_the_node_says_it_in_log_and_diagnostics(tmp_path):
     """Once while it lasts, and at once when planes' frames contradict."""
     pytest.importorskip('rclpy')
     import ros_client as ros
-    with ros.NodeProcess(tmp_path / 'log.txt', 'time_budget:=0', ros.BASE, ros.RADIUS, domain=ros.OTHER) as node, ros.Client(domain=ros.OTHER) as client:
+    with (ros.NodeProcess(tmp_path / 'log.txt', 'time_budget:=0', ros.BASE, ros.RADIUS, domain=ros.OTHER) as node,
+          ros.Client(domain=ros.OTHER) as client):
         assert client.connected() and client.insist(lambda: client.paths), node.log
         assert client.good() and client.hears(POSED)
         assert node.log.count(POSED) == 1 and '[WARN]' in next(line for line in node.log.splitlines() if POSED in line)
@@ -106,7 +115,8 @@ def test_the_node_says_it_in_log_and_diagnostics(tmp_path):
             client.send([], infos=[])
             for plane, m, i in zip('ab', images, infos):
                 i.header.stamp = m.header.stamp = ros.time_msg(client.now_ns)
-                i.header.frame_id, m.header.frame_id = f'plane_{plane}_optical', f'plane_{"ba"["ab".index(plane)]}_optical'
+                i.header.frame_id, m.header.frame_id = (f'plane_{plane}_optical',
+                                                        f'plane_{"ba"["ab".index(plane)]}_optical')
             for publisher, m in zip((*client.infos, *client.images), (*infos, *images)):
                 publisher.publish(m)
         words = 'plane A: its images are of frame "plane_b_optical", its camera info of "plane_a_optical"'

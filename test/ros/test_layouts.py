@@ -7,10 +7,13 @@ import pytest
 
 from fluoro_shape_ros.resources import resource_path
 
-TOPICS = {'/backbone': 'Path', '/tip': 'PointStamped', '/tip_pose': 'PoseWithCovarianceStamped', '/backbone_points': 'PointCloud2', '/markers': 'MarkerArray',
+TOPICS = {'/backbone': 'Path', '/tip': 'PointStamped', '/tip_pose': 'PoseWithCovarianceStamped',
+          '/backbone_points': 'PointCloud2', '/markers': 'MarkerArray',
           '/plane_a/overlay': 'Image', '/plane_b/overlay': 'Image', '/diagnostics': 'DiagnosticArray'}
-# displays of rviz_default_plugins in Jazzy (its plugins_description.xml) and what they show; None: nothing from a topic of ours
-RVIZ_DISPLAYS = {'Axes': None, 'Grid': None, 'TF': None, 'Image': 'Image', 'MarkerArray': 'MarkerArray', 'Path': 'Path', 'PointCloud2': 'PointCloud2',
+# displays of rviz_default_plugins in Jazzy (its plugins_description.xml) and what they show;
+# None: nothing from a topic of ours
+RVIZ_DISPLAYS = {'Axes': None, 'Grid': None, 'TF': None, 'Image': 'Image', 'MarkerArray': 'MarkerArray', 'Path': 'Path',
+                 'PointCloud2': 'PointCloud2',
                  'PointStamped': 'PointStamped', 'PoseWithCovariance': 'PoseWithCovarianceStamped'}
 FOXGLOVE_PANELS = {'3D', 'Image', 'Plot', 'DiagnosticSummary', 'DiagnosticStatusPanel'}
 
@@ -21,7 +24,8 @@ def test_rviz_shows_backbone_tip_markers_and_both_overlays():
     shown = {}
     for display in manager['Displays']:
         package, kind = display['Class'].split('/')
-        assert package == 'rviz_default_plugins' and kind in RVIZ_DISPLAYS and display['Enabled'] == display['Value'], display['Name']
+        assert (package == 'rviz_default_plugins' and kind in RVIZ_DISPLAYS
+                and display['Enabled'] == display['Value']), display['Name']
         if RVIZ_DISPLAYS[kind] is not None:
             topic = display['Topic']['Value']
             assert TOPICS[topic] == RVIZ_DISPLAYS[kind], topic
@@ -43,5 +47,6 @@ def test_foxglove_shows_backbone_tip_markers_both_overlays_and_diagnostics():
     assert {name.split('!')[0] for name in panels} == FOXGLOVE_PANELS
     named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(panels)))
     assert named == {*TOPICS, '/fluoro_shape'}     # the node's name stands before those of its statuses
-    assert [panels[f'Image!plane_{p}']['imageMode']['imageTopic'] for p in 'ab'] == ['/plane_a/overlay', '/plane_b/overlay']
+    assert [panels[f'Image!plane_{p}']['imageMode']['imageTopic'] for p in 'ab'] == ['/plane_a/overlay',
+                                                                                     '/plane_b/overlay']
     assert all(panels['3D!backbone']['topics'][topic]['visible'] for topic in ('/markers', '/backbone', '/tip_pose'))

@@ -12,7 +12,8 @@ from msg_adapters.images import MAX_PIXELS, BadImage
 
 
 def image(height, width, data=b''):
-    return SimpleNamespace(header='head', encoding='mono8', height=height, width=width, step=width, is_bigendian=0, data=data)
+    return SimpleNamespace(header='head', encoding='mono8', height=height, width=width, step=width, is_bigendian=0,
+                           data=data)
 
 
 @pytest.mark.parametrize('msg, says', [
@@ -51,7 +52,8 @@ def png(**damage):
 
 
 @pytest.mark.parametrize('data, says', [
-    (png(IDAT=b'\x7f\xff\xff\x00'), 'cut short or damaged after 33 of'),     # found by fuzz.py: 2 GB and seconds in OpenCV 5
+    # found by fuzz.py: 2 GB and seconds in OpenCV 5
+    (png(IDAT=b'\x7f\xff\xff\x00'), 'cut short or damaged after 33 of'),
     (png()[:-1], 'cut short'),
     (png()[:20], 'cut short'),
     (png().replace(b'IHDR\0\0\0\x08\0\0\0\x06', b'IHDR\0\1\0\0\0\1\0\0'), '65536x65536 pixels'),
@@ -63,4 +65,5 @@ def test_a_png_that_promises_more_than_it_holds_is_refused_before_it_is_read(dat
 
 
 def test_a_good_png_is_read():
-    assert decode(SimpleNamespace(header='head', format='png', data=png() + b'more')).tolist() == np.arange(48).reshape(6, 8).tolist()
+    assert (decode(SimpleNamespace(header='head', format='png', data=png() + b'more')).tolist()
+            == np.arange(48).reshape(6, 8).tolist())

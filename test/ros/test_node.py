@@ -46,7 +46,8 @@ def test_good_pair(client):
     assert np.linalg.norm(X[:, None] - ros.curve(), axis=2).min(axis=1).max() < TOLERANCE
     steps = np.linalg.norm(np.diff(X, axis=0), axis=1)
     assert np.allclose(steps[:-1], 0.001, atol=2e-5)
-    q = np.array([[p.pose.orientation.x, p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w] for p in path.poses])
+    q = np.array([[p.pose.orientation.x, p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w]
+                  for p in path.poses])
     x, y, z, w = q.T
     x_axis = np.c_[1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
     tangent = np.gradient(X, axis=0)
@@ -115,7 +116,8 @@ def test_too_many_pairs_are_dropped_not_queued(client):
     stamps = [client.send_pixels(GOOD) for _ in range(5)]
     assert client.answer(stamps[-1])
     client.until(lambda: len(client.paths) + int(client.value('pairing', 'dropped')) - dropped == 5)
-    assert set(client.paths) <= set(stamps) and len(client.paths) + int(client.value('pairing', 'dropped')) - dropped == 5
+    assert (set(client.paths) <= set(stamps)
+            and len(client.paths) + int(client.value('pairing', 'dropped')) - dropped == 5)
 
 
 def test_after_stamps_jump_back_the_second_pair_works(client):
@@ -147,7 +149,8 @@ def test_pause_and_resume(client):
     ('time_budget', -0.1, 'time_budget'),
 ])
 def test_a_value_that_cannot_work_is_refused_and_the_old_one_stays(client, name, value, reason):
-    get = lambda: client.call(GetParameters, '/fluoro_shape/get_parameters', GetParameters.Request(names=[name])).values   # noqa: E731
+    get = lambda: client.call(GetParameters, '/fluoro_shape/get_parameters',    # noqa: E731
+                              GetParameters.Request(names=[name])).values
     before = get()
     result = client.set(name, value)
     assert not result.successful and reason in result.reason
@@ -167,10 +170,12 @@ def test_parameters_take_effect_at_run_time(client):
 
 
 def test_what_is_not_found_in_time_is_named_and_counted(client):
-    assert client.set('time_budget', 1e-6).successful and client.trigger('reset').success       # so that there is nothing to track
+    # so that there is nothing to track
+    assert client.set('time_budget', 1e-6).successful and client.trigger('reset').success
     stamp = client.send_pixels(GOOD)
     assert client.hears('out_of_time: no curve was found by then') and stamp not in client.paths
-    assert int(client.value('reconstruction', 'count out_of_time')) >= 1 and 0 < int(client.value('reconstruction', 'out of time (%)')) <= 100
+    assert (int(client.value('reconstruction', 'count out_of_time')) >= 1
+            and 0 < int(client.value('reconstruction', 'out of time (%)')) <= 100)
     assert client.set('time_budget', 0).successful      # no limit
     assert client.answer(client.send_pixels(GOOD))
 
@@ -227,7 +232,8 @@ def test_a_prediction_is_used_and_a_bad_or_stale_one_named(client):
 
 def test_16_bits_in_either_byte_order(client):
     for big in (0, 1):
-        pair = [(pixels.astype(np.uint16) * 16).astype('>u2' if big else '<u2') for pixels in GOOD]     # 12 bits: the low byte alone says nothing
+        # 12 bits: the low byte alone says nothing
+        pair = [(pixels.astype(np.uint16) * 16).astype('>u2' if big else '<u2') for pixels in GOOD]
         stamp = client.send([image_msg(pixels, encoding='mono16', is_bigendian=big, step=2 * SIZE) for pixels in pair])
         path, _ = client.answer(stamp)
         assert np.linalg.norm(points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < TOLERANCE
@@ -240,21 +246,24 @@ def test_distortion_is_removed_unless_the_images_are_rectified(client):
     for angle in (0, 90):
         R, t = ros.pose(angle)
         px = cv2.projectPoints(ros.curve(), cv2.Rodrigues(R)[0], t, K, D)[0][:, 0]
-        bent = np.c_[px, np.ones(len(px))] @ np.linalg.inv(K).T * (ros.curve() @ R[2] + t[2])[:, None]     # as if a camera without distortion saw that
+        # as if a camera without distortion saw that
+        bent = np.c_[px, np.ones(len(px))] @ np.linalg.inv(K).T * (ros.curve() @ R[2] + t[2])[:, None]
         infos.append(info_msg(ros.projection(angle), k=K.ravel(), d=D))
         pair.append(ros.draw(K @ np.eye(3, 4), points=bent))
 
     def error():
         path, _ = client.answer(client.send_pixels(pair, infos=infos))
         return np.linalg.norm(points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max()
-    assert min(error() for _ in range(2)) < TOLERANCE      # where the machine is slow, the first pair may have come before its camera
+    # where the machine is slow, the first pair may have come before its camera
+    assert min(error() for _ in range(2)) < TOLERANCE
     assert client.set('rectified', True).successful
     assert error() > 0.005
     assert client.set('rectified', False).successful
 
 
 def jpeg_msg(pixels):
-    return ros.CompressedImage(format='mono8; jpeg compressed ', data=ros.bytes_of(cv2.imencode('.jpg', pixels)[1].tobytes()))
+    return ros.CompressedImage(format='mono8; jpeg compressed ',
+                               data=ros.bytes_of(cv2.imencode('.jpg', pixels)[1].tobytes()))
 
 
 def test_compressed_images(client):

@@ -39,7 +39,8 @@ HERE = 'import os; del os.memfd_create'     # so that the node itself reconstruc
 
 
 def spoilt(patch, folder, here):
-    """The code of a node where `patch` is run in the process that reconstructs: the node itself (`here`), or its child, which takes it from its path."""
+    """The code of a node where `patch` is run in the process that reconstructs: the node itself (`here`), or its child,
+    which takes it from its path."""
     if here:
         return f'{HERE}\n{patch}\nimport sys; from fluoro_shape_ros.node import main; sys.exit(main())'
     (folder / 'sitecustomize.py').write_text(patch)
@@ -61,7 +62,8 @@ def test_a_signal_in_the_middle_of_a_pair(log, tmp_path, number, here):
 
 
 @pytest.mark.parametrize('first, second', [
-    (signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGTERM), (signal.SIGHUP, signal.SIGHUP)])
+    (signal.SIGINT, signal.SIGINT), (signal.SIGTERM, signal.SIGINT), (signal.SIGINT, signal.SIGTERM),
+    (signal.SIGHUP, signal.SIGHUP)])
 def test_more_signals_while_it_ends_change_nothing(log, first, second):
     with NodeProcess(log, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.until(lambda: 'images on' in node.log)
@@ -85,22 +87,26 @@ def test_the_log_tells_what_it_listens_to_what_is_missing_and_the_first_result(l
         ros_node.WARN_S = 1.0
         sys.exit(main())"""
     given = 'reference_frame:=cell', 'robot_radus:=0.001', 'time_budget:=0', BASE, ros.RADIUS
-    with NodeProcess(log, *given, code=code, arguments=('-r', 'plane_b/image_raw:=/lateral'), domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+    with NodeProcess(log, *given, code=code, arguments=('-r', 'plane_b/image_raw:=/lateral'),
+                     domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.until(lambda: 'no results: plane a: no image yet' in node.log)
         first, second = node.log.splitlines()[:2]
         assert first.startswith('[WARN]') and first.endswith('there is no parameter robot_radus, but robot_radius')
         assert second.startswith('[INFO]') and all(words in second for words in (
-            '/plane_a/image_raw and /lateral', '/plane_a/camera_info and /plane_b/camera_info', '/backbone', 'frame "cell"', 'method spline', 'robot_radius 1 mm'))
+            '/plane_a/image_raw and /lateral', '/plane_a/camera_info and /plane_b/camera_info', '/backbone',
+            'frame "cell"', 'method spline', 'robot_radius 1 mm'))
         client.node.destroy_publisher(client.images[1])
         client.images[1] = client.node.create_publisher(ros.Image, '/lateral', 10)
         assert client.connected() and client.insist(lambda: client.paths, every=1.0) and client.good()
-        blank = lambda: 'pairs gave a result, most often for no_device_in_plane_a: no line of at least' in node.log     # noqa: E731
+        blank = lambda: ('pairs gave a result, most often for no_device_in_plane_a: '    # noqa: E731
+                         'no line of at least' in node.log)
         assert client.insist(blank, pair=ros.BLANK)
         assert node.end() == 0 and node.log.count('[INFO]') == 2 and node.log.count('first result') == 1
 
 
 def test_two_nodes_of_one_name_are_told(log, tmp_path):
-    with NodeProcess(log, domain=ros.OTHER) as node, NodeProcess(tmp_path / 'other.txt', domain=ros.OTHER) as other, Client(domain=ros.OTHER) as client:
+    with (NodeProcess(log, domain=ros.OTHER) as node, NodeProcess(tmp_path / 'other.txt', domain=ros.OTHER) as other,
+          Client(domain=ros.OTHER) as client):
         words = 'nodes are named /fluoro_shape: end all but one'
         assert client.until(lambda: words in node.log and words in other.log)
         assert client.hears(words) and (node.end(), other.end()) == (0, 0)
@@ -142,8 +148,10 @@ def test_poses_of_moving_planes_come_from_tf(log):
                 if self.known_to > time.nanoseconds + 10**9:
                     raise LookupError('the pose is too old')    # as tf has it until it is cleared
                 self.known_to = max(self.known_to, time.nanoseconds)
-                return Fields(transform=Fields(rotation=vector('xyzw', Rotation.from_matrix(R).as_quat()), translation=vector('xyz', t)))
-        sys.modules['tf2_ros'] = Fields(Buffer=Buffer, TransformListener=lambda buffer, node: node, TransformException=LookupError)
+                return Fields(transform=Fields(rotation=vector('xyzw', Rotation.from_matrix(R).as_quat()),
+                                               translation=vector('xyz', t)))
+        sys.modules['tf2_ros'] = Fields(Buffer=Buffer, TransformListener=lambda buffer, node: node,
+                                        TransformException=LookupError)
         sys.exit(main())"""
     parameters = ('geometry:=tf', 'reference_frame:=cell', 'time_budget:=0', BASE, ros.RADIUS)
     with NodeProcess(log, *parameters, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
@@ -156,7 +164,8 @@ def test_poses_of_moving_planes_come_from_tf(log):
                 client.send_pixels(ros.BLANK, infos=infos)
             stamps = [client.now_ns + ros.STEP_NS, client.now_ns + ros.STEP_NS + 5_000_000]
             poses = [np.c_[ros.pose_at(plane, stamp)] for plane, stamp in zip('ab', stamps)]
-            path, _ = client.answer(client.send_pixels([ros.draw(ros.intrinsics() @ pose) for pose in poses], infos=infos, skew_ns=5_000_000))
+            path, _ = client.answer(client.send_pixels([ros.draw(ros.intrinsics() @ pose) for pose in poses],
+                                                       infos=infos, skew_ns=5_000_000))
             assert path.header.frame_id == 'cell'
             assert np.linalg.norm(ros.points(path)[[0, -1]] - ros.curve()[[0, -1]], axis=1).max() < 0.0025
 
@@ -170,13 +179,17 @@ def test_parameter_files_that_are_installed(tmp_path):
             file = resource_path(f'{name}.yaml')
             given[name] = yaml.safe_load(file.read_text())['/**']['ros__parameters']
             arguments = ['--params-file', str(file), '-r', f'__ns:=/{name}']
-            nodes[name] = stack.enter_context(NodeProcess(tmp_path / f'{name}.txt', arguments=arguments, domain=ros.OTHER))
+            nodes[name] = stack.enter_context(NodeProcess(tmp_path / f'{name}.txt', arguments=arguments,
+                                                          domain=ros.OTHER))
         client = stack.enter_context(Client(domain=ros.OTHER))
         for name, values in given.items():
             taken = client.get(*values, node=f'/{name}/fluoro_shape')
-            assert [list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)] == list(values.values()), name
-        assert client.hears('no image yet: nobody publishes /defaults/plane_a/image_raw and /defaults/plane_a/camera_info')
-        assert client.until(lambda: {s.hardware_id for s in client.statuses} == {f'/{name}/fluoro_shape' for name in given})
+            assert ([list(new) if isinstance(old, list) else new for old, new in zip(values.values(), taken)]
+                    == list(values.values())), name
+        assert client.hears('no image yet: nobody publishes /defaults/plane_a/image_raw and '
+                            '/defaults/plane_a/camera_info')
+        assert client.until(lambda: {s.hardware_id for s in client.statuses}
+                                    == {f'/{name}/fluoro_shape' for name in given})
         assert all(s.name.startswith(f'{s.hardware_id}: ') for s in client.statuses)
 
 
@@ -204,7 +217,8 @@ def test_a_pair_that_takes_long_is_told_and_a_bug_in_a_callback_ends_nothing(log
         assert client.connected()
         assert client.insist(lambda: any('the pair at work takes' in s.message for s in client.statuses)), node.log
         assert client.insist(lambda: client.paths), node.log
-        assert int(client.value('reconstruction', 'overdue pairs')) >= 1 and client.value('reconstruction', 'count internal_error') == '1'
+        assert (int(client.value('reconstruction', 'overdue pairs')) >= 1
+                and client.value('reconstruction', 'count internal_error') == '1')
         assert node.log.count('Traceback') == 1 and 'IndexError' in node.log and 'takes more than' in node.log
 
 
@@ -225,7 +239,8 @@ def test_help():
     (['--ros-args', '-p', 'base_position:=5'], 'base_position: needs a list of numbers, got 5'),
     (['--ros-args', '-p', 'use_sim_time:=1'], "'use_sim_time' to '1' of type 'INTEGER', expecting type 'BOOL'"),
     (['--ros-args', '-p', 'tracking:="true"'], "tracking: needs a bool, got 'true'"),
-    (['--ros-args', '-p', 'qos_overrides./tip.publisher.depth:=many'], 'qos_overrides./tip.publisher.depth: needs a whole number'),
+    (['--ros-args', '-p', 'qos_overrides./tip.publisher.depth:=many'],
+     'qos_overrides./tip.publisher.depth: needs a whole number'),
     (['--ros-args', '--wings'], '--wings'),
 ])
 def test_unusable_arguments(arguments, words):

@@ -34,11 +34,14 @@ def test_what_ends_the_reconstruction_is_named_and_the_next_pair_answered(log):
     before = shared_memory()
     with NodeProcess(log, PATIENT, BASE, ros.RADIUS, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
         assert client.connected() and client.insist(lambda: client.paths, every=1.0), node.log
-        assert client.value('reconstruction', 'process') == 'its own' and client.value('reconstruction', 'reconstruction restarted') == '0'
-        for times, (number, words) in enumerate([(signal.SIGKILL, 'it died of SIGKILL'), (signal.SIGSTOP, 'it hung: no answer within 3.0 s')], 1):
+        assert (client.value('reconstruction', 'process') == 'its own'
+                and client.value('reconstruction', 'reconstruction restarted') == '0')
+        for times, (number, words) in enumerate([(signal.SIGKILL, 'it died of SIGKILL'),
+                                                 (signal.SIGSTOP, 'it hung: no answer within 3.0 s')], 1):
             del client.statuses[:]
             os.kill(pid_of(node, client), number)
-            assert client.insist(lambda: any(f'reconstruction restarted: {words}' in s.message for s in client.statuses), every=1.0), node.log    # noqa: B023
+            assert client.insist(lambda: any(f'reconstruction restarted: {words}' in s.message    # noqa: B023
+                                             for s in client.statuses), every=1.0), node.log
             assert client.good() and client.value('reconstruction', 'reconstruction restarted') == str(times)
             assert f'reconstruction restarted: {words}' in node.log
         pid = pid_of(node, client)
@@ -48,13 +51,15 @@ def test_what_ends_the_reconstruction_is_named_and_the_next_pair_answered(log):
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT], ids=lambda s: s.name)
 def test_a_process_that_hangs_is_not_left_behind(log, number):
-    with NodeProcess(log, 'time_budget:=0', BASE, ros.RADIUS, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+    with (NodeProcess(log, 'time_budget:=0', BASE, ros.RADIUS, domain=ros.OTHER) as node,
+          Client(domain=ros.OTHER) as client):
         assert client.connected(), node.log
         pid = pid_of(node, client)
         os.kill(pid, signal.SIGSTOP)
         assert client.insist(lambda: int(client.value('pairing', 'pairs')))
         node.end(number)
-        assert client.until(lambda: gone(pid)) and node.process.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 0)
+        assert (client.until(lambda: gone(pid))
+                and node.process.returncode == (-signal.SIGKILL if number == signal.SIGKILL else 0))
 
 
 def test_where_no_other_process_can_see_the_images_the_node_does_the_work_and_says_so(log):
@@ -63,8 +68,11 @@ def test_where_no_other_process_can_see_the_images_the_node_does_the_work_and_sa
         from fluoro_shape_ros.node import main
         del os.memfd_create
         sys.exit(main())"""
-    with NodeProcess(log, 'time_budget:=0', BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+    with (NodeProcess(log, 'time_budget:=0', BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node,
+          Client(domain=ros.OTHER) as client):
         assert client.connected() and client.insist(lambda: client.paths, every=1.0), node.log
-        assert client.value('reconstruction', 'process') == 'the node itself: this system has no memfd_create' and not reconstructing_for(node.process.pid)
-        told = [line for line in node.log.splitlines() if 'not in a process of its own: this system has no memfd_create' in line]
+        assert (client.value('reconstruction', 'process') == 'the node itself: this system has no memfd_create'
+                and not reconstructing_for(node.process.pid))
+        told = [line for line in node.log.splitlines()
+                if 'not in a process of its own: this system has no memfd_create' in line]
         assert len(told) == 1 and told[0].startswith('[INFO]')

@@ -40,7 +40,8 @@ def heard(client):
 
 
 def heard_all(client, heard, stamp, topics=ON_DEMAND):
-    assert client.until(lambda: all(stamp in heard[topic] for topic in topics)), {t: sorted(m)[-3:] for t, m in heard.items()}
+    assert client.until(lambda: all(stamp in heard[topic] for topic in topics)), {t: sorted(m)[-3:]
+                                                                                  for t, m in heard.items()}
     return [heard[topic][stamp] for topic in topics]
 
 
@@ -55,16 +56,18 @@ def test_outputs_on_demand(client, heard):
     assert (variance > 0).all() and np.sqrt(variance.max()) < TOLERANCE
     assert cloud.width == len(path.poses) and [cloud.fields[k].name for k in (4, -1)] == ['sigma', 'confidence']
     confidence = np.frombuffer(cloud.data, '<f4').reshape(cloud.width, -1)[:, -1]
-    assert len(np.unique(confidence)) == 1 and not (np.abs(confidence - 0.5) > 0.5).any()      # NaN while it is not known
+    assert len(np.unique(confidence)) == 1 and not (np.abs(confidence - 0.5) > 0.5).any()   # NaN while it is not known
     tube = next(m for m in markers.markers if m.ns == 'tube')
     corners = np.array([[p.x, p.y, p.z] for p in tube.points])
-    assert np.allclose(np.linalg.norm(corners[:, None] - points(path), axis=2).min(axis=1), 0.001, rtol=0.01)     # robot_radius
+    # robot_radius
+    assert np.allclose(np.linalg.norm(corners[:, None] - points(path), axis=2).min(axis=1), 0.001, rtol=0.01)
     for picture, P in zip(overlays, VIEWS):
         assert (picture.encoding, picture.height, picture.width, picture.step) == ('bgr8', SIZE, SIZE, 3 * SIZE)
         u, v, w = P @ [*points(path)[len(path.poses) // 2], 1]
         pixels = np.frombuffer(picture.data, np.uint8).reshape(SIZE, SIZE, 3)
         near = pixels[round(v / w) - 1:round(v / w) + 2, round(u / w) - 1:round(u / w) + 2]
-        assert np.ptp(near, axis=2).max() > 60      # the image is grey; a coloured line, blended at its edges, is drawn there
+        # the image is grey; a coloured line, blended at its edges, is drawn there
+        assert np.ptp(near, axis=2).max() > 60
 
 
 class Recorder:
@@ -74,7 +77,8 @@ class Recorder:
         self.published = {}
 
     def create_publisher(self, kind, topic, *_, **__):
-        return SimpleNamespace(publish=lambda msg: self.published.update({topic: msg}), get_subscription_count=lambda: 1)
+        return SimpleNamespace(publish=lambda msg: self.published.update({topic: msg}),
+                               get_subscription_count=lambda: 1)
 
 
 def test_the_confidence_of_a_result_is_in_every_point_and_in_words():
@@ -121,7 +125,8 @@ def test_what_nobody_listens_to_is_not_computed(tmp_path):
             real = getattr(outputs, name)
             setattr(outputs, name, lambda *a, real=real, name=name: print('made', name, flush=True) or real(*a))
         sys.exit(main())"""
-    with NodeProcess(tmp_path / 'log.txt', BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node, Client(domain=ros.OTHER) as client:
+    with (NodeProcess(tmp_path / 'log.txt', BASE, ros.RADIUS, code=code, domain=ros.OTHER) as node,
+          Client(domain=ros.OTHER) as client):
         assert client.connected() and client.insist(lambda: client.paths), node.log
         assert client.good() and client.good() and 'made' not in node.log
         with client.listening({'markers': MarkerArray}) as heard:

@@ -93,7 +93,8 @@ def test_a_jump_back_starts_anew_at_once(back_ms):
     pairer = Pairer(SLOP)
     feed(pairer, [(p, 30000 + 66 * k) for k in range(3) for p in 'ab'])
     start = 30000 + 66 * 2 - back_ms
-    assert feed(pairer, [(p, start + 66 * k) for k in range(3) for p in 'ab']) == [(start + 66 * k,) * 2 for k in range(3)]
+    assert feed(pairer, [(p, start + 66 * k) for k in range(3) for p in 'ab']) == [(start + 66 * k,) * 2
+                                                                                   for k in range(3)]
     assert pairer.counts.jumps == 1
 
 

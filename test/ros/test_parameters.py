@@ -28,7 +28,8 @@ def make(context):
 
     def make(**overrides):
         given = [Parameter(name, value=value) for name, value in overrides.items()]
-        nodes.append(rclpy.create_node('params_test', context=context, parameter_overrides=given, start_parameter_services=False))
+        nodes.append(rclpy.create_node('params_test', context=context, parameter_overrides=given,
+                                       start_parameter_services=False))
         return nodes[-1]
 
     yield make
@@ -83,7 +84,8 @@ def test_overrides_are_taken(make, name, given, taken):
     ('qos_overrides./backbone.publisher.reliability', 5, 'reliability: must be one of'),
     ('qos_overrides./backbone.publisher.reliability', 'auto', 'reliability: must be one of'),
     ('qos_overrides./backbone.publisher.history', [1, 2], 'history: must be one of'),
-    ('qos_overrides./plane_a/camera_info.subscription.durability', 'maybe', 'durability: must be one of system_default, transient_local, volatile'),
+    ('qos_overrides./plane_a/camera_info.subscription.durability', 'maybe',
+     'durability: must be one of system_default, transient_local, volatile'),
 ])
 def test_unusable_overrides_are_refused_by_name(make, name, given, reason):
     with pytest.raises(ConfigError) as error:
@@ -92,7 +94,8 @@ def test_unusable_overrides_are_refused_by_name(make, name, given, reason):
 
 
 def test_qos_overrides_that_can_work_are_let_through(make):
-    given = {'backbone.publisher.depth': 3, 'plane_a/image_raw.subscription.reliability': 'auto', 'tip.publisher.reliability': 'best_effort',
+    given = {'backbone.publisher.depth': 3, 'plane_a/image_raw.subscription.reliability': 'auto',
+             'tip.publisher.reliability': 'best_effort',
              'plane_a/image_raw.subscription.history': 'keep_all', 'backbone.publisher.deadline': 'some time'}
     assert params.declare(make(**{f'qos_overrides./{name}': value for name, value in given.items()})) == Config()
 
@@ -111,10 +114,12 @@ def test_descriptors_say_what_the_config_knows(make):
     params.declare(node)
     for f in fields():
         d = node.describe_parameter(f.name)
-        assert f.metadata['description'] in d.description and f.metadata['unit'] in d.description and not d.dynamic_typing
+        assert (f.metadata['description'] in d.description and f.metadata['unit'] in d.description
+                and not d.dynamic_typing)
         assert all(choice in d.additional_constraints for choice in f.metadata['choices'])
         ranges = [*d.floating_point_range, *d.integer_range]
-        assert [(r.from_value, r.to_value) for r in ranges] == ([] if f.metadata['low'] is None else [(f.metadata['low'], f.metadata['high'])])
+        assert ([(r.from_value, r.to_value) for r in ranges]
+                == ([] if f.metadata['low'] is None else [(f.metadata['low'], f.metadata['high'])]))
     assert node.describe_parameter('base_position').type == ParameterType.PARAMETER_DOUBLE_ARRAY
     assert node.describe_parameter('base_position').additional_constraints == 'none or 3 numbers'
     assert node.describe_parameter('expected_length').additional_constraints == 'none or 2 numbers, 0 <= min < max'
@@ -123,7 +128,8 @@ def test_descriptors_say_what_the_config_knows(make):
 
 
 def test_a_change_keeps_everything_else():
-    config = params.changed(Config.from_values(polarity='bright'), [Parameter('base_position', value=[1.0, 2.0, 3.0]), Parameter('use_sim_time', value=True)])
+    config = params.changed(Config.from_values(polarity='bright'),
+                            [Parameter('base_position', value=[1.0, 2.0, 3.0]), Parameter('use_sim_time', value=True)])
     assert config == Config.from_values(polarity='bright', base_position=(1.0, 2.0, 3.0))
 
 

@@ -1,4 +1,5 @@
-"""Pairing over any order of arrival: never a wrong pair, never an image twice, never an older pair after a newer one, memory bounded."""
+"""Pairing over any order of arrival: never a wrong pair, never an image twice, never an older pair after a newer one,
+memory bounded."""
 
 import pytest
 
@@ -14,7 +15,8 @@ from fluoro_shape_ros.ros.waiting import PATIENCE_S, CameraBook, Pair, WaitingRo
 
 MS = 1_000_000
 T0 = 10**12
-ANY_STAMP = st.one_of(st.integers(-5, 5), st.integers(0, 2**33 * 10**9), st.integers(0, 2000).map(lambda ms: T0 + ms * MS))
+ANY_STAMP = st.one_of(st.integers(-5, 5), st.integers(0, 2**33 * 10**9),
+                      st.integers(0, 2000).map(lambda ms: T0 + ms * MS))
 
 
 @st.composite
@@ -48,7 +50,8 @@ def check_pairs(frames, slop_ns):
             stamps = stamp_a, frames[b][1]
             assert abs(stamps[0] - stamps[1]) <= slop_ns and a not in used and b not in used
             assert all(new > old for new, old in zip(stamps, last))
-            assert all(frame >= oldest for kind, oldest in (u for u in used if isinstance(u, tuple)) for frame in (a, b))   # nothing from before a jump
+            assert all(frame >= oldest for kind, oldest in (u for u in used if isinstance(u, tuple))
+                       for frame in (a, b))   # nothing from before a jump
             used |= {a, b}
             last, pairs = stamps, pairs + 1
         assert pairer.waiting <= 2 * BUFFER
@@ -85,7 +88,8 @@ def test_after_any_mess_the_second_good_pair_comes_out(frames):
 
 
 @examples(2)
-@given(st.lists(st.tuples(st.sampled_from(['pair', 'a', 'b', 'a', 'b', 'rewind']), st.integers(0, 60), st.floats(0, 1)), max_size=80))
+@given(st.lists(st.tuples(st.sampled_from(['pair', 'a', 'b', 'a', 'b', 'rewind']), st.integers(0, 60), st.floats(0, 1)),
+                max_size=80))
 def test_pairs_leave_the_room_in_order_once_and_in_time(events):
     """Pairs come with growing stamps, cameras with any; after each event somebody asks."""
     room, books, now, stamp, seen = WaitingRoom(), (CameraBook(), CameraBook()), 0.0, T0, []

@@ -1,4 +1,5 @@
-"""Pairs that are reconstructed in a process of its own: the same answers as in this one, whatever ends it is named, and nothing stays behind. No ROS."""
+"""Pairs that are reconstructed in a process of its own: the same answers as in this one, whatever ends it is named, and
+nothing stays behind. No ROS."""
 
 import os
 import signal
@@ -29,7 +30,8 @@ LATE = 1e-9         # a time that is over
 
 
 def frame(images, stamp_ns=5):
-    return Frame(stamp_ns, 'cell', tuple(images), tuple(make_view(name, P, drawing.SIZE, drawing.SIZE) for name, P in zip('ab', VIEWS)))
+    return Frame(stamp_ns, 'cell', tuple(images),
+                 tuple(make_view(name, P, drawing.SIZE, drawing.SIZE) for name, P in zip('ab', VIEWS)))
 
 
 def until(condition):
@@ -66,9 +68,11 @@ def pid_of(reconstructor):
 
 def same(one, other):
     """Whether two results say the same."""
-    if one.shape is not None and not (np.array_equal(one.shape.points, other.shape.points) and np.array_equal(one.shape.covariance, other.shape.covariance)):
+    if one.shape is not None and not (np.array_equal(one.shape.points, other.shape.points)
+                                      and np.array_equal(one.shape.covariance, other.shape.covariance)):
         return False
-    return (one.outcome, one.detail, one.warnings, one.search is None) == (other.outcome, other.detail, other.warnings, other.search is None)
+    return (one.outcome, one.detail, one.warnings, one.search is None) == (other.outcome, other.detail, other.warnings,
+                                                                           other.search is None)
 
 
 def test_the_answers_are_those_of_the_pipeline(shared, lost):
@@ -78,7 +82,8 @@ def test_the_answers_are_those_of_the_pipeline(shared, lost):
     prior = Prior(previous=first.shape, previous_stamp_ns=5)
     wide = [np.pad(image, ((0, 0), (0, 9)), mode='edge').astype(np.uint16) * 100 for image in GOOD]
     masks = tuple(image.astype(np.float32) for image in BLANK)
-    for images, given in ((GOOD, prior), (wide, Prior()), (GOOD, replace(prior, masks=masks)), (BLANK, Prior(masks=masks)), (GOOD, Prior())):
+    for images, given in ((GOOD, prior), (wide, Prior()), (GOOD, replace(prior, masks=masks)),
+                          (BLANK, Prior(masks=masks)), (GOOD, Prior())):
         assert same(shared(frame(images, 7), CONFIG, given), reconstruct(frame(images, 7), CONFIG, given))
     assert lost == []
 
@@ -109,27 +114,32 @@ def test_a_process_that_dies_over_a_pair_costs_that_pair(shared, lost):
     os.kill(pid, signal.SIGSTOP)
     threading.Timer(0.1, os.kill, (pid, signal.SIGKILL)).start()
     result = shared(frame(GOOD), CONFIG)
-    assert (result.outcome, result.detail) == (Outcome.INTERNAL_ERROR, 'reconstruction restarted: it died of SIGKILL') and lost == ['it died of SIGKILL']
+    assert ((result.outcome, result.detail) == (Outcome.INTERNAL_ERROR, 'reconstruction restarted: it died of SIGKILL')
+            and lost == ['it died of SIGKILL'])
 
 
 def test_a_process_that_hangs_is_ended(shared, lost):
     pid = pid_of(shared)
     os.kill(pid, signal.SIGSTOP)
     result = shared(frame(GOOD), HASTY)
-    assert (result.outcome, result.detail) == (Outcome.INTERNAL_ERROR, 'reconstruction restarted: it hung: no answer within 1.1 s') and gone(pid)
+    assert (result.outcome, result.detail) == (Outcome.INTERNAL_ERROR, 'reconstruction restarted: it hung: '
+                                                                       'no answer within 1.1 s') and gone(pid)
     assert lost == ['it hung: no answer within 1.1 s']
 
 
 @pytest.mark.parametrize('budget, method, pixels, limit', [
-    (0.2, 'spline', 1024**2, 1.4), (0.5, 'spline', 1024**2, 2.0), (0.2, 'spline', 4096**2, 4.4), (0.0, 'spline', 1024**2, None), (0.2, 'paper', 1024**2, None)])
+    (0.2, 'spline', 1024**2, 1.4), (0.5, 'spline', 1024**2, 2.0), (0.2, 'spline', 4096**2, 4.4),
+    (0.0, 'spline', 1024**2, None), (0.2, 'paper', 1024**2, None)])
 def test_how_long_a_pair_may_take(budget, method, pixels, limit):
-    assert patience_s(Config.from_values(time_budget=budget, method=method), pixels) == (None if limit is None else pytest.approx(limit))
+    assert (patience_s(Config.from_values(time_budget=budget, method=method), pixels)
+            == (None if limit is None else pytest.approx(limit)))
 
 
 def test_a_bug_over_there_is_told_here_and_the_next_pair_goes_on(shared, lost):
     with pytest.raises(BugThere, match='^AttributeError: ') as raised:
         shared(frame(GOOD), CONFIG, Prior(previous='no shape', previous_stamp_ns=1))
-    assert raised.value.bug.kind.startswith('AttributeError in /') and raised.value.bug.trace.startswith('Traceback') and lost == []
+    assert (raised.value.bug.kind.startswith('AttributeError in /')
+            and raised.value.bug.trace.startswith('Traceback') and lost == [])
 
 
 def test_who_ends_it_need_not_wait_for_the_pair_at_work():
@@ -156,7 +166,8 @@ def test_it_ends_with_the_process_that_began_it_even_where_it_hangs():
             print('ready', flush=True)
             sys.stdin.read()"""
     places = [str(Path(sys.modules['fluoro_shape_ros'].__file__).parents[1]), os.environ.get('PYTHONPATH', '')]
-    with subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, 'PYTHONPATH': os.pathsep.join(places)}) as parent:
+    with subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                          env={**os.environ, 'PYTHONPATH': os.pathsep.join(places)}) as parent:
         assert parent.stdout.readline() == b'ready\n'
         pid, = reconstructing_for(parent.pid)
         os.kill(pid, signal.SIGSTOP)
@@ -168,7 +179,8 @@ def test_it_ends_with_the_process_that_began_it_even_where_it_hangs():
 def answered_here():
     """Whether a good pair is answered though there is no process but the ones before."""
     others = reconstructing_for(os.getpid())    # before one is begun that may take its time to end
-    return lambda reconstructor: reconstructor(frame(GOOD), CONFIG).outcome is Outcome.OK and reconstructing_for(os.getpid()) == others
+    return lambda reconstructor: (reconstructor(frame(GOOD), CONFIG).outcome is Outcome.OK
+                                  and reconstructing_for(os.getpid()) == others)
 
 
 @pytest.mark.parametrize('program, why, told', [
@@ -182,7 +194,8 @@ def test_where_no_process_gets_ready_this_one_does_the_work(monkeypatch, answere
         reconstructor.told = reasons.append
         assert answered_here(reconstructor) and why in reconstructor.here
     # the first one may end before anybody is there to be told
-    assert len(told) - 1 <= len(reasons) <= len(told) and all(reason.startswith(start) for reason, start in zip(reasons, told))
+    assert (len(told) - 1 <= len(reasons) <= len(told)
+            and all(reason.startswith(start) for reason, start in zip(reasons, told)))
 
 
 def test_where_there_is_one_core_this_process_does_the_work(monkeypatch, answered_here):

@@ -1,4 +1,5 @@
-"""What one untrusted publisher can do: the node's memory and time stay bounded, it names what it refuses, and the next good pair works."""
+"""What one untrusted publisher can do: the node's memory and time stay bounded, it names what it refuses, and the next
+good pair works."""
 
 import xml.etree.ElementTree as ET
 
@@ -18,7 +19,8 @@ from fluoro_shape_ros.resources import resource_path
 
 LIMIT = 60.0        # s, for whatever must happen: the machine may be busy
 MOST_MB = 2000      # of resident memory, ever: some of the largest images that may come, being received
-OPTIONAL = {'/plane_a/image_raw/compressed', '/plane_b/image_raw/compressed', '/tf', '/tf_static', '/clock'}   # subscribed only when a parameter says so
+# subscribed only when a parameter says so
+OPTIONAL = {'/plane_a/image_raw/compressed', '/plane_b/image_raw/compressed', '/tf', '/tf_static', '/clock'}
 
 
 @pytest.fixture(scope='module')
@@ -43,7 +45,8 @@ def says(client, *words):
 def test_the_policy_names_what_the_node_has_and_nothing_else(client):
     names = {}
     for kind, right in (('topics', 'subscribe'), ('topics', 'publish'), ('services', 'reply')):
-        profile = ET.parse(resource_path('sros2_policy.xml')).find('enclaves/enclave[@path="/fluoro_shape"]/profiles/profile[@node="fluoro_shape"]')
+        profile = ET.parse(resource_path('sros2_policy.xml')).find(
+            'enclaves/enclave[@path="/fluoro_shape"]/profiles/profile[@node="fluoro_shape"]')
         assert profile.get('ns') == '/'
         listed = [entry.text for block in profile.findall(kind) if block.get(right) == 'ALLOW' for entry in block]
         assert len(listed) == len(set(listed))
@@ -53,7 +56,8 @@ def test_the_policy_names_what_the_node_has_and_nothing_else(client):
     def has(listing):
         return {name for name, _ in listing('fluoro_shape', '/')}
     assert client.until(lambda: has(graph.get_publisher_names_and_types_by_node) == names['publish'], LIMIT)
-    assert client.until(lambda: has(graph.get_subscriber_names_and_types_by_node) == names['subscribe'] - OPTIONAL, LIMIT)
+    assert client.until(lambda: has(graph.get_subscriber_names_and_types_by_node) == names['subscribe'] - OPTIONAL,
+                        LIMIT)
     # nodes describe their types only where ROS is new enough
     described = {'/fluoro_shape/get_type_description'}
     assert client.until(lambda: has(graph.get_service_names_and_types_by_node) | described == names['reply'], LIMIT)
@@ -119,7 +123,8 @@ def test_names_without_end(client):
 
 def test_bytes_that_are_no_message(client):
     """What the middleware can't read it drops, but predictions are read by the node itself."""
-    for publisher, message in ((client.images[0], image_msg(GOOD[0])), (client.infos[1], info_msg(VIEWS[1])), (client.prediction, Path(poses=[PoseStamped()] * 3))):
+    for publisher, message in ((client.images[0], image_msg(GOOD[0])), (client.infos[1], info_msg(VIEWS[1])),
+                               (client.prediction, Path(poses=[PoseStamped()] * 3))):
         data = bytes(serialize_message(message))
         for damaged in (data[:9], data[:len(data) // 2], data[:4] + b'\xff' * (len(data) - 4)):
             publisher.publish(damaged)

@@ -1,4 +1,5 @@
-"""geometry:=tf: the example that is installed, poses of a C-arm that moves, and what is said where tf2 is not installed."""
+"""geometry:=tf: the example that is installed, poses of a C-arm that moves, and what is said where tf2 is not
+installed."""
 
 import subprocess
 import sys
@@ -31,7 +32,8 @@ def camera_from(reference_from_camera):
 
 @pytest.fixture(scope='module')
 def example():
-    """Child frame -> R, t of reference_from_camera, as example_tf.launch.yaml has static_transform_publisher publish them."""
+    """Child frame -> R, t of reference_from_camera, as example_tf.launch.yaml has static_transform_publisher publish
+    them."""
     yaml = pytest.importorskip('yaml')
     poses = {}
     for entry in yaml.safe_load(resource_path('example_tf.launch.yaml').read_text())['launch']:
@@ -49,13 +51,15 @@ def pair(new, calibrations, stamps):
     """The job of a pair in the geometry tf."""
     frames = [f'plane_{plane}_optical' for plane in PLANES]
     cameras = tuple(camera(calibration_to_camera_info(c, 0, frame, new)) for c, frame in zip(calibrations, frames))
-    images = tuple(array_to_image(np.zeros((c.height, c.width), np.uint8), stamp, frame, new) for c, stamp, frame in zip(calibrations, stamps, frames))
+    images = tuple(array_to_image(np.zeros((c.height, c.width), np.uint8), stamp, frame, new)
+                   for c, stamp, frame in zip(calibrations, stamps, frames))
     return Job(stamps[0], images, cameras, Config.from_values(geometry='tf', reference_frame=REFERENCE), 0, 0.0)
 
 
 def test_the_example_is_the_biplane_c_arm_of_full_matrices(new, example):
     calibrations = [read_calibration(resource_path(f'example_plane_{plane}.yaml')) for plane in PLANES]
-    frame = adapt(pair(new, calibrations, (5, 5)), view_of, lambda reference, child, stamp: camera_from(example[child]), Tally())
+    frame = adapt(pair(new, calibrations, (5, 5)), view_of, lambda reference, child, stamp: camera_from(example[child]),
+                  Tally())
     assert frame.frame_id == REFERENCE
     for view, full in zip(frame.views, carm.biplane()):
         assert (view.width, view.height, view.distortion) == (full.width, full.height, None)
@@ -90,11 +94,13 @@ def test_what_tf_does_not_know_is_named(new, example):
 
 def transform(R, t):
     x, y, z, w = Rotation.from_matrix(R).as_quat()
-    return SimpleNamespace(rotation=SimpleNamespace(x=x, y=y, z=z, w=w), translation=SimpleNamespace(x=t[0], y=t[1], z=t[2]))
+    return SimpleNamespace(rotation=SimpleNamespace(x=x, y=y, z=z, w=w),
+                           translation=SimpleNamespace(x=t[0], y=t[1], z=t[2]))
 
 
 class StandIn:
-    """What the node uses of tf2_ros, with tf's own rule: lookup_transform(target, source) takes points of the source frame to the target frame."""
+    """What the node uses of tf2_ros, with tf's own rule: lookup_transform(target, source) takes points of the source
+    frame to the target frame."""
 
     class TransformException(Exception):
         pass
@@ -102,7 +108,8 @@ class StandIn:
     class Buffer:
         def lookup_transform(self, target_frame, source_frame, time, timeout):
             if target_frame != 'plane_a_optical':
-                raise StandIn.TransformException(f'"{target_frame}" passed to lookupTransform argument target_frame does not exist.')
+                raise StandIn.TransformException(f'"{target_frame}" passed to lookupTransform argument target_frame '
+                                                 'does not exist.')
             assert timeout.nanoseconds > 0
             R, t = turning(source_frame, target_frame, time.nanoseconds)
             return SimpleNamespace(transform=transform(np.array(R), t))
@@ -142,7 +149,8 @@ def test_a_real_buffer_interpolates_between_poses(monkeypatch):
         q = turn.as_quat()
         made[0].set_transform(TransformStamped(
             header=Header(frame_id=REFERENCE, stamp=Time(sec=stamp)), child_frame_id='plane_a_optical',
-            transform=Transform(translation=Vector3(x=x, y=0.0, z=1.0), rotation=Quaternion(x=q[0], y=q[1], z=q[2], w=q[3]))), 'test')
+            transform=Transform(translation=Vector3(x=x, y=0.0, z=1.0),
+                                rotation=Quaternion(x=q[0], y=q[1], z=q[2], w=q[3]))), 'test')
     half = Slerp([0, 1], turns)(0.5).as_matrix(), np.array([0.2, 0.0, 1.0])
     for got, expected in zip(lookup(REFERENCE, 'plane_a_optical', 10 * SECOND + SECOND // 2), camera_from(half)):
         assert np.allclose(got, expected, atol=1e-9)
@@ -158,5 +166,7 @@ def test_a_real_buffer_interpolates_between_poses(monkeypatch):
 def test_without_tf2_the_node_says_so_in_one_line():
     pytest.importorskip('rclpy')
     code = 'import sys; sys.modules["tf2_ros"] = None; from fluoro_shape_ros.node import main; sys.exit(main())'
-    done = subprocess.run([sys.executable, '-c', code, '--ros-args', '-p', 'geometry:=tf'], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1 and done.stderr.count('\n') == 1 and 'needs tf2_ros, which is not installed' in done.stderr, done.stderr
+    done = subprocess.run([sys.executable, '-c', code, '--ros-args', '-p', 'geometry:=tf'], capture_output=True,
+                          text=True, timeout=60)
+    assert (done.returncode == 1 and done.stderr.count('\n') == 1
+            and 'needs tf2_ros, which is not installed' in done.stderr), done.stderr

@@ -19,7 +19,8 @@ from msg_adapters.bags import open_bag
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / 'docs' / 'connect.md').read_text(encoding='utf-8')
-ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(ros.OTHER), 'PYTHONPATH': os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
+ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(ros.OTHER),
+               'PYTHONPATH': os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))}
 
 
 def block(name):
@@ -27,12 +28,14 @@ def block(name):
 
 
 def start(arguments, folder):
-    return subprocess.Popen([sys.executable, *arguments], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen([sys.executable, *arguments], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, text=True)
 
 
 @pytest.fixture
 def answered(tmp_path):
-    with ros.NodeProcess(tmp_path / 'log.txt', 'reference_frame:=cell', domain=ros.OTHER) as node, ros.Client(domain=ros.OTHER) as client:
+    with (ros.NodeProcess(tmp_path / 'log.txt', 'reference_frame:=cell', domain=ros.OTHER) as node,
+          ros.Client(domain=ros.OTHER) as client):
         assert client.connected(), node.log
         yield client
 
@@ -43,7 +46,8 @@ def said(client, line, folder):
     assert program == 'python'
     with start(arguments, folder) as process:
         try:
-            assert any(client.send([ros.image_msg(pixels[:64, :64]) for pixels in ros.BLANK]) and client.until(lambda: process.poll() is not None, 0.1) for _ in range(600)), line
+            assert any(client.send([ros.image_msg(pixels[:64, :64]) for pixels in ros.BLANK])
+                       and client.until(lambda: process.poll() is not None, 0.1) for _ in range(600)), line
             out, errors = process.communicate()
         finally:
             process.kill()
@@ -67,9 +71,11 @@ def test_a_recording(answered, tmp_path):
     (tmp_path / 'record.py').write_text(block('record'))
     with start(['record.py'], tmp_path) as process:
         try:
-            hearing = lambda: all(p.get_subscription_count() == 2 for p in (*answered.images, *answered.infos))     # noqa: E731
+            hearing = lambda: all(p.get_subscription_count() == 2    # noqa: E731
+                                  for p in (*answered.images, *answered.infos))
             assert answered.until(hearing)
-            stored = lambda: (tmp_path / 'case1').exists() and sum(f.stat().st_size for f in (tmp_path / 'case1').iterdir()) > 100_000     # noqa: E731
+            stored = lambda: ((tmp_path / 'case1').exists()    # noqa: E731
+                              and sum(f.stat().st_size for f in (tmp_path / 'case1').iterdir()) > 100_000)
             assert any(answered.send_pixels(ros.BLANK) and answered.until(stored, 0.05) for _ in range(400))
             process.send_signal(signal.SIGINT)
             _, errors = process.communicate(timeout=30)

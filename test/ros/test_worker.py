@@ -9,7 +9,18 @@ import pytest
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Frame, Outcome, Reconstruction, Shape
-from fluoro_shape_ros.ros.worker import Job, Memory, NoTransform, Prediction, Worker, adapt, camera, checked_camera, image_window, view_of
+from fluoro_shape_ros.ros.worker import (
+    Job,
+    Memory,
+    NoTransform,
+    Prediction,
+    Worker,
+    adapt,
+    camera,
+    checked_camera,
+    image_window,
+    view_of,
+)
 from msg_adapters.cameras import BadCameraInfo
 from msg_adapters.diagnostics import Tally
 
@@ -20,14 +31,16 @@ P_B = np.array([[20, 0, -500.0, 0.8 * 20], [20, 500, 0, 0.8 * 20], [1, 0, 0, 0.8
 
 def info(P=P_A, frame_id='plane_a_optical', **fields):
     roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
-    values = dict(header=SimpleNamespace(frame_id=frame_id), height=40, width=40, distortion_model='', d=[], k=[500.0, 0, 20, 0, 500, 20, 0, 0, 1],
+    values = dict(header=SimpleNamespace(frame_id=frame_id), height=40, width=40, distortion_model='', d=[],
+                  k=[500.0, 0, 20, 0, 500, 20, 0, 0, 1],
                   r=np.eye(3).ravel(), p=P.ravel(), binning_x=0, binning_y=0, roi=roi)
     return SimpleNamespace(**{**values, **fields})
 
 
 def image(value=7, size=40, encoding='mono8', stamp=5):
     head = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=stamp))
-    return SimpleNamespace(header=head, encoding=encoding, height=size, width=size, step=size, is_bigendian=0, data=bytes([value]) * size * size)
+    return SimpleNamespace(header=head, encoding=encoding, height=size, width=size, step=size, is_bigendian=0,
+                           data=bytes([value]) * size * size)
 
 
 def job(images=None, infos=None, generation=0, prediction=None, **values):
@@ -75,7 +88,8 @@ def test_poses_come_from_tf_when_they_should():
         asked.append((reference, camera_frame, stamp_ns))
         return ((1.0, 0, 0), (0, 0, -1.0), (0, 1.0, 0)), (0.0, 0.0, 0.8)
     infos = info(), info(frame_id='plane_b_optical')
-    frame = adapt(job((image(), image(stamp=8)), infos, geometry='tf', reference_frame='cell'), view_of, lookup, Tally())
+    frame = adapt(job((image(), image(stamp=8)), infos, geometry='tf', reference_frame='cell'), view_of,
+                  lookup, Tally())
     assert asked == [('cell', 'plane_a_optical', 5), ('cell', 'plane_b_optical', 8)]
     assert np.allclose(frame.views[0].P, [[500, 20, 0, 16], [0, 20, -500, 16], [0, 1, 0, 0.8]])
 
@@ -168,7 +182,8 @@ def test_a_mask_is_the_mean_of_the_pairs():
 
 @pytest.mark.parametrize('changed', [
     dict(images=(image(size=30), image()), infos=(info(height=30, width=30), info(P_B))),
-    dict(infos=(info(height=80, width=80, roi=SimpleNamespace(x_offset=3, y_offset=0, width=40, height=40)), info(P_B))),
+    dict(infos=(info(height=80, width=80, roi=SimpleNamespace(x_offset=3, y_offset=0, width=40, height=40)),
+                info(P_B))),
 ])
 def test_a_mask_that_no_longer_fits_is_cleared_and_said_so(changed):
     memory = Memory()
@@ -196,7 +211,8 @@ class Gate:
     """Work that can be held up; `done` are the jobs in the order they were begun."""
 
     def __init__(self):
-        self.begun, self.open, self.done, self.failed, self.idle = threading.Event(), threading.Event(), [], [], threading.Event()
+        self.begun, self.open, self.done, self.failed, self.idle = (threading.Event(), threading.Event(), [], [],
+                                                                    threading.Event())
 
     def work(self, job):
         self.done.append(job)

@@ -1,4 +1,5 @@
-"""A background that breathes: by how much it moves, what stays where it is, and that a CT stands where its projection does."""
+"""A background that breathes: by how much it moves, what stays where it is, and that a CT stands where its projection
+does."""
 
 import dataclasses
 
@@ -37,7 +38,8 @@ def test_a_quarter_of_a_beat_moves_it_aside(by_hand):
 
 
 def test_only_what_moves_is_moved_by_a_breath_and_all_by_the_patient(by_hand):
-    alone = dataclasses.replace(by_hand, still=by_hand.picture, picture=np.ones_like(by_hand.picture), beat_px=(0.0, 0.0))
+    alone = dataclasses.replace(by_hand, still=by_hand.picture, picture=np.ones_like(by_hand.picture),
+                                beat_px=(0.0, 0.0))
     assert_array_equal(alone.at(2.0), alone.at(0.0))
     for b in (alone, dataclasses.replace(by_hand, beat_px=(0.0, 0.0))):
         assert_allclose(b.shifted((2, -3)).at(0.0)[:-3, 2:], b.at(0.0)[3:, :-2], atol=1e-6)
@@ -49,7 +51,7 @@ def test_a_drawn_patient_moves_as_far_as_is_said(seed):
     both = [patient(i, REFERENCE_KEV) for i in (0, 1)]
     assert both[0].breath_phase == both[1].breath_phase and both[0].beat_phase == both[1].beat_phase
     for b in both:
-        assert 0 < b.at(0.3).min() and b.at(0.3).max() <= 1.1       # where an edge is sharp, cubic interpolation overshoots
+        assert 0 < b.at(0.3).min() and b.at(0.3).max() <= 1.1   # where an edge is sharp, cubic interpolation overshoots
         calm = dataclasses.replace(b, beat_px=(0.0, 0.0))
         down = np.stack([calm.displacement(t)[1][::STEP, ::STEP] for t in np.arange(0, 4, 0.1)])
         way = np.ptp(down, axis=0)

@@ -28,7 +28,8 @@ def test_frontal_view():
     (0, 30, (0, 0.8 * np.cos(np.pi / 6), -0.4)),
 ])
 def test_where_the_source_stands(primary, secondary, at):
-    np.testing.assert_allclose(source(carm.view('a', np.deg2rad(primary), np.deg2rad(secondary), ARM).P), at, atol=1e-12)
+    np.testing.assert_allclose(source(carm.view('a', np.deg2rad(primary), np.deg2rad(secondary), ARM).P), at,
+                               atol=1e-12)
 
 
 def test_pixel_sizes_at_isocentre_and_detector():

@@ -14,14 +14,16 @@ from fluoro_shape_ros.sim import carm, ct
 SMALL = carm.CArm(pixel_size_iso=1e-3, width=200, height=160)
 FINE = carm.CArm(pixel_size_iso=0.5e-3, width=300, height=260)         # more than two pixels a voxel
 FRONTAL, LATERAL = carm.biplane(arm=SMALL)
-ODD, STEEP = carm.biplane((0.6, -0.4), (-0.785, 0.615), carm.CArm(sid=1.0, sod=0.6, pixel_size_iso=1.1e-3, width=200, height=160))
+ODD, STEEP = carm.biplane((0.6, -0.4), (-0.785, 0.615),
+                          carm.CArm(sid=1.0, sod=0.6, pixel_size_iso=1.1e-3, width=200, height=160))
 ENLARGED = carm.view('a', 0.6, -0.4, FINE)
 VIEWS = [FRONTAL, LATERAL, ODD, STEEP, ENLARGED]
 SPACING = np.array([2.5, 1.5, 1.2]) * 1e-3      # z, y, x
-LOW, HIGH = np.array([9, 12, 6]), np.array([41, 32, 24])                # voxels x, y, z of the box, first and past the last
+LOW, HIGH = np.array([9, 12, 6]), np.array([41, 32, 24])            # voxels x, y, z of the box, first and past the last
 BOX = (LOW - 0.5) * SPACING[::-1], (HIGH - 0.5) * SPACING[::-1]
 AHEAD = ct.Placement(np.eye(3), (BOX[0] + BOX[1]) / 2)
-TURNED = ct.Placement(Rotation.from_euler('xyz', [0.3, -0.4, 0.2]).as_matrix(), AHEAD.isocentre_m + [0.021, -0.014, 0.009])
+TURNED = ct.Placement(Rotation.from_euler('xyz', [0.3, -0.4, 0.2]).as_matrix(),
+                      AHEAD.isocentre_m + [0.021, -0.014, 0.009])
 WATER_ALONE, BONE_ALONE = 0, 1
 
 
@@ -35,11 +37,13 @@ def rays(view, pose):
     """The source and the (H, W, 3) directions of the pixels' rays in the volume's frame."""
     v, u = np.mgrid[0:view.height, 0:view.width]
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.P[:, :3]).T
-    return source(view.P) @ pose.rotation + pose.isocentre_m, rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ pose.rotation
+    return (source(view.P) @ pose.rotation + pose.isocentre_m,
+            rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ pose.rotation)
 
 
 def chords(view, pose, grown=0.0):
-    """(H, W) m that each ray has in BOX, grown by so many voxels on each side: between its entry into the last slab and its exit from the first."""
+    """(H, W) m that each ray has in BOX, grown by so many voxels on each side: between its entry into the last slab and
+    its exit from the first."""
     eye, directions = rays(view, pose)
     low, high = BOX[0] - grown * SPACING[::-1], BOX[1] + grown * SPACING[::-1]
     with np.errstate(divide='ignore'):
@@ -95,9 +99,9 @@ def test_bone_attenuates_more_than_as_much_water():
 @pytest.mark.parametrize('pose', [AHEAD, TURNED])
 @pytest.mark.parametrize('view', VIEWS)
 def test_chords_of_a_box(view, pose):
-    """Voxels fade out over their width, to both sides of the box's border, and the last cut may stand half a voxel off it. So a chord lies between
-    those of a box that is a voxel smaller and of one that is a voxel larger (two, where what is drawn was enlarged); on average it is right, to half
-    a pixel of the 40 that the box is wide."""
+    """Voxels fade out over their width, to both sides of the box's border, and the last cut may stand half a voxel off
+    it. So a chord lies between those of a box that is a voxel smaller and of one that is a voxel larger (two, where
+    what is drawn was enlarged); on average it is right, to half a pixel of the 40 that the box is wide."""
     lengths = ct.path_lengths(box(), view, pose)
     assert lengths.shape == (view.height, view.width, 2) and lengths.dtype == np.float32
     assert not lengths[..., BONE_ALONE].any()
@@ -121,14 +125,16 @@ def test_bone_comes_second(view):
 
 @pytest.mark.parametrize('view', VIEWS)
 def test_chords_of_a_sphere(view):
-    """2 sqrt(r^2 - d^2) at distance d of its centre; partly filled voxels hold their share, so only their width blurs it."""
+    """2 sqrt(r^2 - d^2) at distance d of its centre; partly filled voxels hold their share,
+    so only their width blurs it."""
     radius, n = 0.03, np.array([34, 50, 64])
     fine = np.stack(np.meshgrid(*((np.arange(4 * k) - 1.5) / 4 * s for k, s in zip(n, SPACING)), indexing='ij'))
     centre = (n - 1) / 2 * SPACING + [1e-3, -0.4e-3, 0.3e-3]
     inside = ((fine - centre[:, None, None, None])**2).sum(axis=0) < radius**2
     share = inside.reshape(n[0], 4, n[1], 4, n[2], 4).mean(axis=(1, 3, 5))
     pose = ct.Placement(TURNED.rotation, centre[::-1] + [0.01, -0.02, 0.015])
-    seen = ct.path_lengths(ct.Volume(np.rint(1000 * share - 1000).astype(np.int16), SPACING), view, pose)[..., WATER_ALONE] / 1000
+    seen = ct.path_lengths(ct.Volume(np.rint(1000 * share - 1000).astype(np.int16), SPACING), view,
+                           pose)[..., WATER_ALONE] / 1000
     eye, directions = rays(view, pose)
     d = np.linalg.norm(np.cross(centre[::-1] - eye, directions), axis=-1)
     true = 2 * np.sqrt(np.maximum(radius**2 - d**2, 0))
@@ -141,10 +147,11 @@ def test_chords_of_a_sphere(view):
 
 @pytest.mark.parametrize('angles', [(0, 0), (1.571, 0), (0.6, -0.4), (0.2, 1.3), (-0.785, 0.615)])
 def test_mass_is_kept(angles):
-    """Seen from afar the rays are parallel, and the sum of what is along them times a pixel's area is the mass; of noise, that pixels
-    sample."""
+    """Seen from afar the rays are parallel, and the sum of what is along them times a pixel's area is the mass; of
+    noise, that pixels sample."""
     rng = np.random.default_rng(1)
-    volume = ct.Volume(np.pad(rng.integers(-1000, 2500, (12, 14, 18)), 1, constant_values=-1000).astype(np.int16), SPACING)
+    volume = ct.Volume(np.pad(rng.integers(-1000, 2500, (12, 14, 18)), 1, constant_values=-1000).astype(np.int16),
+                       SPACING)
     pose = ct.Placement(TURNED.rotation, (np.array([20, 16, 14]) - 1) / 2 * SPACING[::-1])
     view = carm.view('a', *angles, carm.CArm(sid=120.0, sod=100.0, pixel_size_iso=0.4e-3, width=160, height=160))
     masses = ct.path_lengths(volume, view, pose).sum(axis=(0, 1), dtype=float) * 0.4e-3**2
@@ -160,7 +167,8 @@ def test_a_voxel_is_seen_where_it_is(view):
         hu[tuple(at[::-1])] = 3000
         shadow = ct.path_lengths(ct.Volume(hu, SPACING), view, TURNED).sum(axis=2)
         true = project(view.P, TURNED.rotation @ (at * SPACING[::-1] - TURNED.isocentre_m))
-        assert [(shadow * u).sum() / shadow.sum(), (shadow * v).sum() / shadow.sum()] == pytest.approx(list(true), abs=0.1)
+        assert ([(shadow * u).sum() / shadow.sum(), (shadow * v).sum() / shadow.sum()]
+                == pytest.approx(list(true), abs=0.1))
 
 
 def test_the_head_is_up_and_the_face_in_front():
@@ -169,7 +177,8 @@ def test_the_head_is_up_and_the_face_in_front():
     hu[25, 10, 40] = 0          # towards the head, to the front, to the left
     pose = ct.Placement(np.eye(3), np.array([25, 22, 15]) * SPACING[::-1])
     for view, u_sign in ((FRONTAL, -1), (LATERAL, 1)):
-        v, u = np.unravel_index(ct.path_lengths(ct.Volume(hu, SPACING), view, pose)[..., WATER_ALONE].argmax(), (view.height, view.width))
+        v, u = np.unravel_index(ct.path_lengths(ct.Volume(hu, SPACING), view, pose)[..., WATER_ALONE].argmax(),
+                                (view.height, view.width))
         assert v < view.height / 2 - 5 and u_sign * (u - view.width / 2) > 5
 
 
@@ -177,18 +186,21 @@ def test_the_head_is_up_and_the_face_in_front():
 def test_a_shifted_isocentre_is_a_shifted_camera(view):
     """P [R (x - c) - d] has t - M d for t. A turned patient is a turned camera."""
     moved = ct.Placement(TURNED.rotation, TURNED.isocentre_m + TURNED.rotation.T @ [0.01, 0.02, -0.03])
-    camera = make_view('a', np.c_[view.P[:, :3], view.P[:, 3] - view.P[:, :3] @ [0.01, 0.02, -0.03]], view.width, view.height)
+    camera = make_view('a', np.c_[view.P[:, :3], view.P[:, 3] - view.P[:, :3] @ [0.01, 0.02, -0.03]], view.width,
+                       view.height)
     seen = ct.path_lengths(box(), view, moved)
     assert seen.any()
     np.testing.assert_allclose(seen, ct.path_lengths(box(), camera, TURNED), atol=2e-3 * seen.max())
     turned = make_view('a', np.c_[view.P[:, :3] @ TURNED.rotation, view.P[:, 3]], view.width, view.height)
-    np.testing.assert_allclose(ct.path_lengths(box(), turned, ct.Placement(np.eye(3), moved.isocentre_m)), seen, atol=2e-3 * seen.max())
+    np.testing.assert_allclose(ct.path_lengths(box(), turned, ct.Placement(np.eye(3), moved.isocentre_m)), seen,
+                               atol=2e-3 * seen.max())
 
 
 @pytest.mark.parametrize('view', VIEWS)
 def test_what_is_homogeneous_shows_no_seams(view):
-    """Away from the projected edges of a large block the path changes as smoothly as its chord; to nothing but rounding where all rays pass all cuts,
-    and else by what a cut is wide where the rays enter through a side of the block: a small share of hundreds of them."""
+    """Away from the projected edges of a large block the path changes as smoothly as its chord; to nothing but rounding
+    where all rays pass all cuts, and else by what a cut is wide where the rays enter through a side of the block: a
+    small share of hundreds of them."""
     hu = np.zeros((60, 100, 130), np.int16)
     centre = (np.array(hu.shape[::-1]) - 1) / 2 * SPACING[::-1]
     low, high = -SPACING[::-1] / 2, 2 * centre + SPACING[::-1] / 2
@@ -197,7 +209,8 @@ def test_what_is_homogeneous_shows_no_seams(view):
     t = np.stack([(low - eye) / directions, (high - eye) / directions])
     true = 1000 * np.maximum(t.max(axis=0).min(axis=-1) - t.min(axis=0).max(axis=-1), 0)
     bends, true_bends = (np.abs(cv2.Laplacian(x.astype(float), -1, ksize=1)) for x in (seen, true))
-    smooth = cv2.erode(((true_bends < 1e-4 * true.max()) & (true > 0.3 * true.max())).astype(np.uint8), np.ones((9, 9))) > 0
+    smooth = cv2.erode(((true_bends < 1e-4 * true.max()) & (true > 0.3 * true.max())).astype(np.uint8),
+                       np.ones((9, 9))) > 0
     assert smooth.sum() > 5000
     through = view in (FRONTAL, LATERAL)
     assert np.abs(seen - true)[smooth].max() < (1e-4 if through else 3e-3) * true[smooth].mean()
@@ -211,7 +224,8 @@ def test_between_slices_cuts_are_linear():
         places, cuts = zip(*ct._cuts(ramp, number))
         np.testing.assert_allclose(places, (np.arange(8 * number) + 0.5) / number - 0.5)
         expected = 200 + 100 * np.clip(places, 0, 7)
-        np.testing.assert_allclose(np.stack(cuts)[..., WATER_ALONE], np.broadcast_to(expected[:, None, None], (8 * number, 2, 3)), rtol=1e-5)
+        np.testing.assert_allclose(np.stack(cuts)[..., WATER_ALONE],
+                                   np.broadcast_to(expected[:, None, None], (8 * number, 2, 3)), rtol=1e-5)
 
 
 def test_what_is_behind_the_source_does_not_count():
@@ -228,7 +242,8 @@ def test_what_is_behind_the_source_does_not_count():
 def test_a_source_at_infinity():
     """All rays lie along one axis, as far as numbers tell."""
     afar = carm.view('a', 0.0, arm=carm.CArm(sid=2e9, sod=1e9, pixel_size_iso=1e-3, width=1, height=1))
-    assert ct.path_lengths(box(), afar, AHEAD)[0, 0, WATER_ALONE] == pytest.approx(1000 * (BOX[1] - BOX[0])[1], rel=1e-3)
+    assert (ct.path_lengths(box(), afar, AHEAD)[0, 0, WATER_ALONE]
+            == pytest.approx(1000 * (BOX[1] - BOX[0])[1], rel=1e-3))
 
 
 def test_beside_the_field_there_is_nothing():
@@ -245,8 +260,10 @@ def test_a_field_too_wide_is_refused():
 
 
 def body():
-    """A cylinder of water 100 mm across and 100 mm long, hollow along its axis, with a table beside it; both in air. m at its axis (x, y)."""
-    z, y, x = np.meshgrid(np.arange(60) * SPACING[0], np.arange(90) * SPACING[1], np.arange(120) * SPACING[2], indexing='ij')
+    """A cylinder of water 100 mm across and 100 mm long, hollow along its axis, with a table beside it; both in air. m
+    at its axis (x, y)."""
+    z, y, x = np.meshgrid(np.arange(60) * SPACING[0], np.arange(90) * SPACING[1], np.arange(120) * SPACING[2],
+                          indexing='ij')
     r = np.hypot(x - 0.07, y - 0.06)
     hu = np.where((r < 0.05) & (r > 0.01) & (z > 0.02) & (z < 0.12), 0, -1000)
     hu[:, 84:87, 10:110] = 300
@@ -258,12 +275,14 @@ def test_an_isocentre_lies_deep_inside_the_body():
     draws = [ct.draw_placement(np.random.default_rng(seed), volume) for seed in range(40)]
     for pose in draws:
         x, y, z = pose.isocentre_m
-        assert np.hypot(x - 0.07, y - 0.06) < 0.05 - 0.02 and 0.02 + 0.02 < z < 0.12 - 0.02     # the most is 0.05, of which 60 %, less a coarse voxel
+        # the most is 0.05, of which 60 %, less a coarse voxel
+        assert np.hypot(x - 0.07, y - 0.06) < 0.05 - 0.02 and 0.02 + 0.02 < z < 0.12 - 0.02
         np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
         angles = Rotation.from_matrix(pose.rotation).as_euler('xyz')
         assert (np.abs(angles) <= ct.TURN).all()
     assert len({tuple(pose.isocentre_m) for pose in draws}) > 20
-    assert min(np.hypot(*(pose.isocentre_m[:2] - [0.07, 0.06])) for pose in draws) < 0.01      # what the body encloses is inside it
+    # what the body encloses is inside it
+    assert min(np.hypot(*(pose.isocentre_m[:2] - [0.07, 0.06])) for pose in draws) < 0.01
     again = ct.draw_placement(np.random.default_rng(3), volume)
     assert (again.isocentre_m == draws[3].isocentre_m).all() and (again.rotation == draws[3].rotation).all()
 
@@ -340,7 +359,8 @@ AXES = dict(L=(1, 0, 0), R=(-1, 0, 0), P=(0, 1, 0), A=(0, -1, 0), H=(0, 0, 1), F
 
 @pytest.fixture
 def series(tmp_path):
-    """Writes HU as one file a slice: columns count towards the first letter, rows towards the second. Attributes given as a list are by slice."""
+    """Writes HU as one file a slice: columns count towards the first letter, rows towards the second. Attributes given
+    as a list are by slice."""
     pydicom = pytest.importorskip('pydicom', '3.0.1')
 
     def write(letters='LP', slope=1.0, intercept=-1024.0, folder=tmp_path / 'ct', keep=slice(None), **attributes):
@@ -358,13 +378,17 @@ def series(tmp_path):
             file = pydicom.dataset.Dataset()
             file.file_meta = pydicom.dataset.FileMetaDataset()
             file.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
-            file.file_meta.MediaStorageSOPClassUID, file.file_meta.MediaStorageSOPInstanceUID = ct.CT_IMAGE, pydicom.uid.generate_uid()
-            given = dict(SOPClassUID=ct.CT_IMAGE, SOPInstanceUID=file.file_meta.MediaStorageSOPInstanceUID, SeriesInstanceUID='1.2.3',
-                         ImageType=['ORIGINAL', 'PRIMARY', 'AXIAL'], PatientName='Secret^Somebody', Rows=counts[1], Columns=counts[2], SamplesPerPixel=1,
-                         PhotometricInterpretation='MONOCHROME2', BitsAllocated=16, BitsStored=16, HighBit=15, PixelRepresentation=1,
-                         RescaleSlope=slope, RescaleIntercept=intercept, PixelSpacing=[np.abs(down) @ mm, np.abs(right) @ mm],
+            file.file_meta.MediaStorageSOPClassUID, file.file_meta.MediaStorageSOPInstanceUID = (
+                ct.CT_IMAGE, pydicom.uid.generate_uid())
+            given = dict(SOPClassUID=ct.CT_IMAGE, SOPInstanceUID=file.file_meta.MediaStorageSOPInstanceUID,
+                         SeriesInstanceUID='1.2.3',
+                         ImageType=['ORIGINAL', 'PRIMARY', 'AXIAL'], PatientName='Secret^Somebody', Rows=counts[1],
+                         Columns=counts[2], SamplesPerPixel=1, PhotometricInterpretation='MONOCHROME2',
+                         BitsAllocated=16, BitsStored=16, HighBit=15, PixelRepresentation=1, RescaleSlope=slope,
+                         RescaleIntercept=intercept, PixelSpacing=[np.abs(down) @ mm, np.abs(right) @ mm],
                          ImageOrientationPatient=[*map(float, right), *map(float, down)],
-                         ImagePositionPatient=list(np.round((first + k * along) * mm - [100.0, 50.0, 30.0], 3)), PixelData=stored[k].tobytes())
+                         ImagePositionPatient=list(np.round((first + k * along) * mm - [100.0, 50.0, 30.0], 3)),
+                         PixelData=stored[k].tobytes())
             given |= {name: value[k] if isinstance(value, list) else value for name, value in attributes.items()}
             for keyword, value in given.items():
                 if value is not None:
@@ -388,7 +412,8 @@ def test_dicom_with_another_rescale_and_other_files_about(series):
     (folder / 'notes.txt').write_text('not a DICOM file')
     (folder / 'empty').touch()
     (folder / 'sub').mkdir()
-    series(ImageType=['ORIGINAL\\PRIMARY\\LOCALIZER'] * 4, SeriesInstanceUID='1.2.4', folder=folder.parent / 'localizer', keep=slice(1))
+    series(ImageType=['ORIGINAL\\PRIMARY\\LOCALIZER'] * 4, SeriesInstanceUID='1.2.4',
+           folder=folder.parent / 'localizer', keep=slice(1))
     (folder.parent / 'localizer' / '03.dcm').rename(folder / 'localizer.dcm')
     assert (ct.load_ct(folder).hu == HU).all()
 
@@ -405,7 +430,8 @@ def test_dicom_with_another_rescale_and_other_files_about(series):
     (dict(ImagePositionPatient=[[0, 0, z] for z in (0, 2, 4.1, 6)]), None),                       # rounded
     (dict(ImageOrientationPatient=[[1.0, 0, 0, 0, 0.98, 0.199]] * 4), 'oblique'),
     (dict(ImageOrientationPatient=None), 'ImageOrientationPatient is missing or not 6'),
-    (dict(PixelSpacing=[[1.2, 1.4], [1.2, 1.5], [1.2, 1.5], [1.2, 1.5]]), r'ct/03.dcm: its orientation, spacing or size is not that of 02.dcm'),
+    (dict(PixelSpacing=[[1.2, 1.4], [1.2, 1.5], [1.2, 1.5], [1.2, 1.5]]),
+     r'ct/03.dcm: its orientation, spacing or size is not that of 02.dcm'),
     (dict(RescaleSlope=None), 'RescaleSlope is missing'),
     (dict(PixelData=bytes(10)), r'can\'t be decoded \(Explicit VR Little Endian: '),
     (dict(PixelSpacing=[[0.0, 1.0]] * 4), r'spacing_m must lie in \(0'),
@@ -418,7 +444,8 @@ def test_dicom_that_is_no_ct(series, wrong, message):
         return
     with pytest.raises(ct.CtError, match=message) as error:
         ct.load_ct(folder)
-    assert str(error.value).startswith(str(folder)) and '\n' not in str(error.value) and 'Secret' not in str(error.value)
+    assert (str(error.value).startswith(str(folder)) and '\n' not in str(error.value)
+            and 'Secret' not in str(error.value))
 
 
 def test_dicom_that_is_damaged(series):

@@ -77,7 +77,8 @@ def compare(device, view, direction):
     return apart
 
 
-@pytest.mark.parametrize('direction', [(0, 0, 1), (1, -0.3, 0.4), (0.5, 0.866, 0)])     # the last two at 27 and 30 degrees to a ray
+# the last two at 27 and 30 degrees to a ray
+@pytest.mark.parametrize('direction', [(0, 0, 1), (1, -0.3, 0.4), (0.5, 0.866, 0)])
 @pytest.mark.parametrize('view', FINE)
 @pytest.mark.parametrize('name', DEVICES)
 def test_pictures_agree(gvxr, name, view, direction):
@@ -97,7 +98,8 @@ def test_a_bent_device_lies_where_ours_does(gvxr, view):
     """Seen from the wrong side, or upside down, it would not."""
     t = np.linspace(0, 1.5, 800)
     bent = 0.02 * np.c_[np.sin(t) - 0.5, 0.3 * t, 1.2 - 2 * np.cos(t)]
-    theirs, ours = (cv2.GaussianBlur(f(bent, DEVICES['cannula'], view, KEV), (0, 0), 0.7) for f in (gvxr_scene.optical_depth, xray.optical_depth))
+    theirs, ours = (cv2.GaussianBlur(f(bent, DEVICES['cannula'], view, KEV), (0, 0), 0.7)
+                    for f in (gvxr_scene.optical_depth, xray.optical_depth))
     assert np.abs(theirs - ours).max() < 0.06 * ours.max()
     assert theirs.sum() == pytest.approx(ours.sum(), rel=2e-3)
 
@@ -110,8 +112,8 @@ def mean_chord(radius, reach):
 @pytest.mark.parametrize('angle_deg', [90, 60, 30])
 @pytest.mark.parametrize('along', [-0.01, 0.0, 0.01])
 def test_path_through_the_axis(gvxr, angle_deg, along):
-    """2 r / sin(angle between device and ray), less what the two pixels on either side of the axis take off; along the device too, where it nears the
-    source (gVirtualXray is 2 % off there where triangles are as long as the device).
+    """2 r / sin(angle between device and ray), less what the two pixels on either side of the axis take off; along the
+    device too, where it nears the source (gVirtualXray is 2 % off there where triangles are as long as the device).
     """
     view, angle = FINE[0], np.deg2rad(angle_deg)
     axis = np.array([np.sin(angle), np.cos(angle), 0])
@@ -127,7 +129,8 @@ def test_path_through_the_axis(gvxr, angle_deg, along):
 def test_path_through_both_walls(gvxr):
     hollow = Device((Segment(REST, 0.0012, 100.0, 0.0008),))
     depths = gvxr_scene.optical_depth(rod((0, 0, 1)), hollow, FINE[0], KEV)
-    assert depths[150, 199:201].mean() == pytest.approx(100 * (mean_chord(0.0012, 0.2e-3) - mean_chord(0.0008, 0.2e-3)), rel=5e-3)
+    assert depths[150, 199:201].mean() == pytest.approx(100 * (mean_chord(0.0012, 0.2e-3) - mean_chord(0.0008, 0.2e-3)),
+                                                        rel=5e-3)
 
 
 def test_volume_is_kept(gvxr):
@@ -163,7 +166,8 @@ def test_transmission_is_what_a_detector_takes(gvxr):
     backbone = rod((0.3, 0, 1))
     beam = gvxr_scene.transmission(backbone, DEVICES['tube'], FINE[0], KEV)
     ours = np.exp(-gvxr_scene.optical_depth(backbone, DEVICES['tube'], FINE[0], KEV))
-    assert (beam > ours - 1e-6).all() and (beam - ours).max() > 0.01     # Jensen: the mean of exp is more than exp of the mean
+    # Jensen: the mean of exp is more than exp of the mean
+    assert (beam > ours - 1e-6).all() and (beam - ours).max() > 0.01
     assert (beam[:, :150] == 1).all()
     solid = gvxr_scene.transmission(rod((0, 0, 1)), GREY, FINE[0], KEV)
     assert solid[150, 199:201].mean() == pytest.approx(np.exp(-100 * mean_chord(0.0012, 0.2e-3)), rel=1e-3)
@@ -177,7 +181,8 @@ def test_materials_fall_with_energy(gvxr):
 def test_a_device_beside_the_image_and_one_half_in_it(gvxr):
     assert not gvxr_scene.optical_depth(rod((0, 0, 1), centre=(0.5, 0, 0)), GREY, FINE[0], KEV).any()
     assert (gvxr_scene.transmission(rod((0, 0, 1), centre=(0.5, 0, 0)), GREY, FINE[0], KEV) == 1).all()
-    half = gvxr_scene.optical_depth(rod((1, 0, 0), 0.06, (-0.04, 0, 0)), GREY, FINE[0], KEV)       # u from 250 to 550 in an image of 400
+    # u from 250 to 550 in an image of 400
+    half = gvxr_scene.optical_depth(rod((1, 0, 0), 0.06, (-0.04, 0, 0)), GREY, FINE[0], KEV)
     assert half[:, 399].sum() == pytest.approx(half[:, 390].sum(), rel=1e-3) and np.abs(half[:, :245]).max() < 1e-6
 
 
@@ -212,10 +217,12 @@ def test_more_than_opengl_can_draw_is_an_error_of_one_line(gvxr):
 
 
 def test_nothing_is_said_and_the_process_ends_well(gvxr):
-    code = ('import numpy as np\nfrom fluoro_shape_ros.device import load_device\nfrom fluoro_shape_ros.sim import carm, gvxr_scene\n'
-            'print(gvxr_scene.optical_depth(np.linspace([-0.01, 0, 0], [0.01, 0, 0], 9), load_device("rod"), carm.biplane()[0], 60.0).any())')
+    code = ('import numpy as np\nfrom fluoro_shape_ros.device import load_device\n'
+            'from fluoro_shape_ros.sim import carm, gvxr_scene\nprint(gvxr_scene.optical_depth(np.linspace([-0.01, 0, '
+            '0], [0.01, 0, 0], 9), load_device("rod"), carm.biplane()[0], 60.0).any())')
     done = subprocess.run([sys.executable, '-c', f'import sys\nsys.path[:0] = {[p for p in sys.path if p]!r}\n{code}'],
-                          env={k: v for k, v in os.environ.items() if k != 'XDG_RUNTIME_DIR'},      # EGL complains where it is not set
+                          # EGL complains where it is not set
+                          env={k: v for k, v in os.environ.items() if k != 'XDG_RUNTIME_DIR'},
                           capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'True\n', '')
 
@@ -227,7 +234,8 @@ def volume(vertices, triangles):
 
 @pytest.mark.parametrize('name', ['tube', 'cannula', 'ep', 'tendon'])
 def test_meshes_are_closed_and_as_large_as_what_they_stand_for(name):
-    """Each edge is met once either way; the volume is that of the cross-sections along the axis (Pappus), and positive: outside is outside."""
+    """Each edge is met once either way; the volume is that of the cross-sections along the axis (Pappus), and positive:
+    outside is outside."""
     device, t = load_device(name), np.linspace(0, 1.5, 700)
     bent = 0.06 * np.c_[np.sin(t), 0.3 * t**2, 1 - np.cos(t)]
     pieces = device.pieces(arc_length(bent)[-1])
@@ -237,7 +245,8 @@ def test_meshes_are_closed_and_as_large_as_what_they_stand_for(name):
         edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
         assert len(np.unique(edges, axis=0)) == len(edges)
         assert (np.unique(edges, axis=0) == np.unique(edges[:, ::-1], axis=0)).all()
-        expected = sum(np.pi * (p.radius**2 - p.lumen**2) * (p.stop - p.start) for p in pieces if p.material == material)
+        expected = sum(np.pi * (p.radius**2 - p.lumen**2) * (p.stop - p.start)
+                       for p in pieces if p.material == material)
         assert volume(vertices, triangles) == pytest.approx(expected, rel=1e-4)
 
 

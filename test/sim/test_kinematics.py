@@ -35,11 +35,13 @@ def test_tubes_turned_alike_add_up_and_turned_against_each_other_take_away(rotat
 def test_three_tubes_in_one_plane_by_hand():
     """Sections of 20 mm each, all tubes at the same rotation: curvatures (60 + 60 + 30) / 10, (60 + 30) / 4 and 30."""
     sections = THREE.sections(np.array([0.02, 0.02, 0.02, 0.3, 0.3, 0.3]))
-    np.testing.assert_allclose([(p.length, p.curvature, p.rotation) for p in sections], [(0.02, 15, 0.3), (0.02, 22.5, 0.3), (0.02, 30, 0.3)])
+    np.testing.assert_allclose([(p.length, p.curvature, p.rotation) for p in sections],
+                               [(0.02, 15, 0.3), (0.02, 22.5, 0.3), (0.02, 30, 0.3)])
     turn = 0.02 * (15 + 22.5 + 30)
     tip = TubeRobot(THREE.tubes).backbone(np.array([0.02] * 3 + [0.0] * 3))[-1]
     angles = 0.02 * np.cumsum([0, 15, 22.5, 30])
-    across = sum((np.array([np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)])) / k for a, b, k in zip(angles, angles[1:], (15, 22.5, 30)))
+    across = sum((np.array([np.sin(b) - np.sin(a), np.cos(a) - np.cos(b)])) / k
+                 for a, b, k in zip(angles, angles[1:], (15, 22.5, 30)))
     assert angles[-1] == pytest.approx(turn)
     np.testing.assert_allclose(tip, [*across, 0], atol=1e-9)
 
@@ -48,14 +50,18 @@ def test_a_tube_is_straight_before_its_curved_part():
     """The inner tube reaches 10 mm out of the outer one, which is straight: its other 20 mm of curve lie in there."""
     robot = TubeRobot((Tube(3.0, 0.0, 0.06), Tube(1.0, 40.0, 0.03)))
     sections = robot.sections(np.array([0.05, 0.01, 0.0, 1.0]))
-    np.testing.assert_allclose([(p.length, p.curvature) for p in sections], [(0.03, 0), (0.02, 10), (0.01, 40)], atol=1e-12)
+    np.testing.assert_allclose([(p.length, p.curvature) for p in sections], [(0.03, 0), (0.02, 10), (0.01, 40)],
+                               atol=1e-12)
 
 
 def test_a_tendon_segment_bends_to_an_arc():
-    """Pulled by a quarter turn times the tendons' distance: the tip stands aside and ahead of the shaft by the radius of the arc."""
+    """Pulled by a quarter turn times the tendons' distance: the tip stands aside and ahead of the shaft by the radius
+    of the arc."""
     radius = 0.05 / QUARTER
-    for pull, rotation, tip in (((QUARTER * 1e-3, 0), 0, (radius, 0)), ((0, QUARTER * 1e-3), 0, (0, radius)), ((QUARTER * 1e-3, 0), QUARTER, (0, radius))):
-        np.testing.assert_allclose(TENDON.backbone(np.array([0.02, rotation, *pull]))[-1], [0.02 + radius, *tip], atol=1e-9)
+    for pull, rotation, tip in (((QUARTER * 1e-3, 0), 0, (radius, 0)), ((0, QUARTER * 1e-3), 0, (0, radius)),
+                                ((QUARTER * 1e-3, 0), QUARTER, (0, radius))):
+        np.testing.assert_allclose(TENDON.backbone(np.array([0.02, rotation, *pull]))[-1], [0.02 + radius, *tip],
+                                   atol=1e-9)
     np.testing.assert_allclose(TENDON.backbone(np.array([0.02, 1.0, 0, 0]))[-1], [0.07, 0, 0], atol=1e-12)
 
 
@@ -65,7 +71,8 @@ def test_turning_everything_turns_the_robot_and_the_pose_places_it(robot):
     rotations = [k for k, joint in enumerate(robot.joints) if joint.name.startswith('rotation')]
     turned[rotations] += 0.7
     x, y, z = robot.backbone(q).T
-    np.testing.assert_allclose(robot.backbone(turned), np.c_[x, np.cos(0.7) * y - np.sin(0.7) * z, np.sin(0.7) * y + np.cos(0.7) * z], atol=1e-12)
+    np.testing.assert_allclose(robot.backbone(turned), np.c_[x, np.cos(0.7) * y - np.sin(0.7) * z,
+                                                             np.sin(0.7) * y + np.cos(0.7) * z], atol=1e-12)
     placed = type(robot)(**{**vars(robot), 'pose': TURNED})
     np.testing.assert_allclose(placed.backbone(q), np.c_[z, x, y] + [0.1, 0.2, 0.3], atol=1e-12)
 
@@ -86,8 +93,10 @@ def test_a_robot_is_placed_where_its_tip_shall_be(robot):
 
 def test_a_joint_keeps_its_speed_and_its_limits():
     q = np.array([0.02, 0.02, 0.0, 0.0])
-    np.testing.assert_allclose(driven(TWO.joints, q, np.array([0.0205, 9.0, -9.0, 0.05]), 0.1), [0.0205, 0.022, -0.1, 0.05])
-    np.testing.assert_allclose(driven(TWO.joints, q, np.array([9.0, -9.0, 9.0, -9.0]), 1e3), [0.1, 0.004, 2 * np.pi, -2 * np.pi])
+    np.testing.assert_allclose(driven(TWO.joints, q, np.array([0.0205, 9.0, -9.0, 0.05]), 0.1),
+                               [0.0205, 0.022, -0.1, 0.05])
+    np.testing.assert_allclose(driven(TWO.joints, q, np.array([9.0, -9.0, 9.0, -9.0]), 1e3),
+                               [0.1, 0.004, 2 * np.pi, -2 * np.pi])
     np.testing.assert_allclose(limited(TWO.joints, np.array([0.0, 1.0, 0.0, 0.0])), [0.004, 0.1, 0, 0])
 
 
@@ -95,7 +104,8 @@ def test_a_load_bends_a_straight_rod_as_a_cantilever():
     rod = np.c_[np.linspace(0, 0.1, 1001), np.zeros((1001, 2))]
     bent = loaded(rod, np.array([0.0, 6.0, 0.0]))
     x = rod[:, 0]
-    np.testing.assert_allclose(bent[:, 1], 6.0 * x**2 * (0.3 - x) / 6, atol=2e-6)      # F x^2 (3 L - x) / (6 E I): 2 mm at the tip
+    # F x^2 (3 L - x) / (6 E I): 2 mm at the tip
+    np.testing.assert_allclose(bent[:, 1], 6.0 * x**2 * (0.3 - x) / 6, atol=2e-6)
     assert arc_length(bent)[-1] == pytest.approx(0.1, rel=1e-9)
     np.testing.assert_allclose(loaded(rod, np.array([5.0, 0.0, 0.0])), rod, atol=1e-12)     # along the rod: no moment
 

@@ -30,8 +30,8 @@ from msg_adapters.messages import stamp_ns
 from msg_adapters.shapes import path_to_points
 
 DOMAIN = str(1 + (os.getpid() + 50) % 100)      # two runs on one machine do not meet
-TOPICS = {'plane_a/image_raw': Image, 'plane_b/image_raw': Image, 'plane_a/camera_info': CameraInfo, 'plane_b/camera_info': CameraInfo,
-          'ground_truth/backbone': Path, 'ground_truth/tip': PointStamped}
+TOPICS = {'plane_a/image_raw': Image, 'plane_b/image_raw': Image, 'plane_a/camera_info': CameraInfo,
+          'plane_b/camera_info': CameraInfo, 'ground_truth/backbone': Path, 'ground_truth/tip': PointStamped}
 VIEWS = carm.biplane(arm=carm.CArm(pixel_size_iso=1e-3, width=320, height=300))
 LIMIT_S = 20.0
 
@@ -122,7 +122,8 @@ def test_a_frame_without_truth_and_the_clock_for_a_stamp(ears, run):
         later = sim.publish(run.scene())
         assert ears.until(ears.complete)
     assert later > stamp
-    assert list(ears.heard['ground_truth/backbone']) == list(ears.heard['ground_truth/tip']) == ears.complete() == [later]
+    assert (list(ears.heard['ground_truth/backbone']) == list(ears.heard['ground_truth/tip'])
+            == ears.complete() == [later])
     assert ears.heard['ground_truth/tip'][later].header.frame_id == 'cell'
 
 

@@ -70,7 +70,8 @@ def test_centrelines_agree_with_truth_and_each_other(vtk, seed, view):
 
 @pytest.mark.parametrize('angle_deg', [90, 60, 30])
 def test_path_through_the_axis(angle_deg):
-    """2 r / sin(angle between device and ray); the pixel of 0.2 mm is 1/12 of the tube: its mean over it is 0.2 % less."""
+    """2 r / sin(angle between device and ray); the pixel of 0.2 mm is 1/12 of the tube: its mean over it is 0.2 %
+    less."""
     view, angle = FINE[0], np.deg2rad(angle_deg)
     lengths = xray.path_length(rod((np.sin(angle), np.cos(angle), 0)), RADIUS, view)
     at_isocentre = lengths[149:151, 199:201].mean()
@@ -98,20 +99,24 @@ def test_crossing_adds_up():
 
 
 def test_coverage_is_the_area_of_the_shadow(vtk):
-    assert vtk_scene.coverage(rod((0, 0, 1)), RADIUS, FINE[0]).sum() * 0.2e-3**2 == pytest.approx(2 * RADIUS * 0.03, rel=0.01)
+    assert (vtk_scene.coverage(rod((0, 0, 1)), RADIUS, FINE[0]).sum() * 0.2e-3**2
+            == pytest.approx(2 * RADIUS * 0.03, rel=0.01))
     middle = vtk_scene.render(rod((0, 0, 1)), RADIUS, FINE[0], device=0.12, background=0.75)[150]
-    assert middle[199:201] == pytest.approx(0.12) and middle[:190] == pytest.approx(0.75) and middle[210:] == pytest.approx(0.75)
+    assert (middle[199:201] == pytest.approx(0.12) and middle[:190] == pytest.approx(0.75)
+            and middle[210:] == pytest.approx(0.75))
 
 
 @pytest.mark.parametrize('out', [(1, 0, 0.2), (-1, 0, 0.2), (0.3, 0, -1)])
 def test_ends_are_flat_and_where_they_should_be(vtk, out):
-    """Along the axis the shadow falls to a half exactly at the tip; here the tip stands at the isocentre, where its face is seen edge-on."""
+    """Along the axis the shadow falls to a half exactly at the tip; here the tip stands at the isocentre, where its
+    face is seen edge-on."""
     view, centre = FINE[0], -np.array(out) / np.linalg.norm(out) * 0.01
     tip, inner = np.array([199.5, 149.5]), project(view.P, centre)
     along = (tip - inner) / np.linalg.norm(tip - inner)
     reach, side = np.arange(-4, 4.01, 0.05), np.arange(-3, 3.01, 0.25)
     at = (tip + reach[:, None, None] * along + side[:, None] * np.array([-along[1], along[0]])).astype(np.float32)
-    for shadow in (vtk_scene.coverage(rod(out, 0.02, centre), RADIUS, view), xray.path_length(rod(out, 0.02, centre), RADIUS, view)):
+    for shadow in (vtk_scene.coverage(rod(out, 0.02, centre), RADIUS, view),
+                   xray.path_length(rod(out, 0.02, centre), RADIUS, view)):
         profile = cv2.remap(shadow, at[..., 0], at[..., 1], cv2.INTER_LINEAR).mean(axis=1)
         assert abs(np.interp(-profile[:20].mean() / 2, -profile, reach)) < 0.05
 
@@ -124,7 +129,8 @@ def test_device_outside_leaves_the_image_alone(vtk):
 
 def test_half_outside_shows_the_other_half(vtk):
     backbone = rod((1, 0, 0), length=0.06, centre=(-0.04, 0, 0))    # u from 250 to 550 in an image of 400
-    for shadow in (vtk_scene.coverage(backbone, RADIUS, FINE[0]) * 2 * RADIUS, xray.path_length(backbone, RADIUS, FINE[0])):
+    for shadow in (vtk_scene.coverage(backbone, RADIUS, FINE[0]) * 2 * RADIUS,
+                   xray.path_length(backbone, RADIUS, FINE[0])):
         assert shadow[:, 398].sum() == pytest.approx(shadow[:, 396].sum(), rel=0.02)
         assert shadow[:, 399].max() > 1.9 * RADIUS and not shadow[:, :245].any()
 
@@ -155,7 +161,8 @@ def test_the_seeds_noise_and_blur():
 def test_quantum_noise_is_poisson(photons):
     """Variance = mean, in counts, for few and for many."""
     exposure = xray.Exposure(photons=photons, depth=16, white=0.5, blur_px=0)
-    counts = xray.expose(np.full((400, 400), 0.5, np.float32), exposure, np.random.default_rng(4)) / (0.5 * 65535) * photons
+    counts = (xray.expose(np.full((400, 400), 0.5, np.float32), exposure, np.random.default_rng(4))
+              / (0.5 * 65535) * photons)
     assert counts.mean() == pytest.approx(photons / 2, rel=0.01)
     assert counts.var() == pytest.approx(photons / 2, rel=0.03)
 
@@ -166,7 +173,8 @@ def test_full_scale(depth, dtype, full):
     image = xray.expose(beam, xray.Exposure(depth=depth, white=1.0, blur_px=0), None)
     assert image.dtype == dtype
     assert image.tolist() == [[0, np.rint(full / 2), full]]
-    over = xray.expose(np.full((100, 100), 1, np.float32), xray.Exposure(depth=depth, white=1.0), np.random.default_rng(0))
+    over = xray.expose(np.full((100, 100), 1, np.float32), xray.Exposure(depth=depth, white=1.0),
+                       np.random.default_rng(0))
     assert over.max() == full and over.min() > full / 2       # noise above white is cut, and does not wrap
 
 
@@ -177,7 +185,8 @@ def test_impossible_exposures_are_refused(wrong):
 
 
 def test_a_bend_is_as_thick_as_a_rod():
-    """Pappus: a bent tube has the volume of its cross-section times its axis' length, and its shadow is symmetric about the axis."""
+    """Pappus: a bent tube has the volume of its cross-section times its axis' length, and its shadow is symmetric about
+    the axis."""
     t = np.linspace(0, 1.5, 2000)
     bent = 0.02 * np.c_[np.sin(t), 0 * t, 1 - np.cos(t)]
     lengths = xray.path_length(bent, RADIUS, FINE[0])
@@ -189,13 +198,15 @@ def test_a_bend_is_as_thick_as_a_rod():
 def test_source_is_where_path_length_looks_from():
     """Magnification: a rod nearer to the source casts a longer shadow."""
     towards = source(FINE[0].P) / np.linalg.norm(source(FINE[0].P))
-    spans = [np.ptp(np.flatnonzero(xray.path_length(rod((0, 0, 1), centre=towards * d), RADIUS, FINE[0])[:, 199])) for d in (0.0, 0.2)]
+    spans = [np.ptp(np.flatnonzero(xray.path_length(rod((0, 0, 1), centre=towards * d), RADIUS, FINE[0])[:, 199]))
+             for d in (0.0, 0.2)]
     assert spans[1] / spans[0] == pytest.approx(0.81 / (0.81 - 0.2), rel=0.02)
 
 
 def test_without_any_opengl_vtk_says_so_and_does_not_crash(monkeypatch):
     pytest.importorskip('vtkmodules.vtkRenderingOpenGL2')
     monkeypatch.delenv('DISPLAY', raising=False)
-    monkeypatch.setattr(vtk_scene, '_loads', lambda library: False)     # no machine can be without its libraries for one test
+    # no machine can be without its libraries for one test
+    monkeypatch.setattr(vtk_scene, '_loads', lambda library: False)
     with pytest.raises(vtk_scene.NoOpenGL, match='libEGL'):
         vtk_scene.coverage(rod((1, 0, 0)), RADIUS, FINE[0])

@@ -17,14 +17,16 @@ def small(seed, **options):
 
 def angles_to(directions, points, others):
     """(N,) rad between unsigned 3-D or image directions at points and others."""
-    cosine = np.abs(np.sum(directions * others, axis=1)) / np.linalg.norm(directions, axis=1) / np.linalg.norm(others, axis=1)
+    cosine = (np.abs(np.sum(directions * others, axis=1)) / np.linalg.norm(directions, axis=1)
+              / np.linalg.norm(others, axis=1))
     return np.arccos(np.minimum(cosine, 1))
 
 
 @pytest.mark.parametrize('views', [SMALL, OBLIQUE])
 @pytest.mark.parametrize('seed', range(4))
 def test_device_stands_inside_and_is_well_seen(views, seed):
-    truth = scenes.xray_run(seed, views=views, lengths=SHORT, kind=('spline', 'cannula')[seed % 2], anatomy=False).backbone()
+    truth = scenes.xray_run(seed, views=views, lengths=SHORT, kind=('spline', 'cannula')[seed % 2],
+                            anatomy=False).backbone()
     middle, tangent = (truth[1:] + truth[:-1]) / 2, np.diff(truth, axis=0)
     for view, other in (views, views[::-1]):
         uv = project(view.P, truth)
@@ -40,7 +42,8 @@ def test_a_device_along_a_ray_or_an_epipolar_line_is_not_well_seen():
     assert placement.well_seen(rod * [0, 0, 1], SMALL)
     assert not placement.well_seen(rod * [0, 1, 0], SMALL)      # along plane A's beam
     assert not placement.well_seen(rod * [0.7, 0.7, 0.1], SMALL)    # in the plane of both beams
-    assert placement.well_seen(rod * [1, 0, 0.5], SMALL)        # 27 degrees off plane A's epipolar lines, which run along x
+    assert placement.well_seen(rod * [1, 0, 0.5], SMALL)        # 27 degrees off plane A's epipolar lines,
+                                                                # which run along x
     assert not placement.well_seen(rod * [1, 0, 0.3], SMALL)    # 17
 
 
@@ -152,7 +155,8 @@ def test_depth_and_photons_reach_the_image():
     image = scene.frame.images[0]
     assert image.dtype == np.uint16 and 1.1 * 255 < image.max() <= 4095
     assert np.median(image) == pytest.approx(0.95 * 4095, rel=0.01)
-    assert image[:200, :200].std() / image[:200, :200].mean() == pytest.approx(1 / 20, rel=0.3)    # white is cut at full scale
+    # white is cut at full scale
+    assert image[:200, :200].std() / image[:200, :200].mean() == pytest.approx(1 / 20, rel=0.3)
 
 
 @pytest.mark.parametrize('clutter', [('blades',), ('field',), ('blades', 'field')])
@@ -197,8 +201,8 @@ def test_text_is_burnt_in_at_the_border(dtype):
 
 
 @pytest.mark.parametrize('size', [(320, 320), (301, 457)])
-@pytest.mark.parametrize('make', [anatomy.anatomy, anatomy.tissue, anatomy.ribs, anatomy.spine, anatomy.vessels, anatomy.leads, anatomy.blades,
-                                  anatomy.intensifier])
+@pytest.mark.parametrize('make', [anatomy.anatomy, anatomy.tissue, anatomy.ribs, anatomy.spine, anatomy.vessels,
+                                  anatomy.leads, anatomy.blades, anatomy.intensifier])
 def test_anatomy_transmits_a_share_of_the_beam(make, size):
     for seed in range(4):
         beam = make(np.random.default_rng(seed), size)

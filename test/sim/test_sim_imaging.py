@@ -1,4 +1,5 @@
-"""How images are taken and shown, by hand: blur, scatter, noise of a dose, the display's curve, window and unsharp mask."""
+"""How images are taken and shown, by hand: blur, scatter, noise of a dose, the display's curve, window and unsharp
+mask."""
 
 import dataclasses
 
@@ -63,7 +64,8 @@ def test_exposure_is_set_by_the_middle_of_the_open_field():
 
 
 @pytest.mark.parametrize('display, gamma, expected', [
-    ('linear', 1.0, (0.8 - 0.4) / 0.8), ('gamma', 0.5, (np.sqrt(0.8) - np.sqrt(0.4)) / (np.sqrt(1.2) - np.sqrt(0.4))), ('logarithmic', 1.0, np.log(2) / np.log(3))])
+    ('linear', 1.0, (0.8 - 0.4) / 0.8), ('gamma', 0.5, (np.sqrt(0.8) - np.sqrt(0.4)) / (np.sqrt(1.2) - np.sqrt(0.4))),
+    ('logarithmic', 1.0, np.log(2) / np.log(3))])
 def test_display_is_its_curve_between_black_and_white(display, gamma, expected):
     chain = dataclasses.replace(PLAIN, display=display, gamma=gamma)
     shown = imaging.show(np.array([[0.4, 0.8, 1.2, 0.1, 3.0]], np.float32), chain, Levels(1.0, 0.4, 1.2))[0] / 65535
@@ -87,7 +89,8 @@ def test_sharpening_overshoots_beside_an_edge_and_nowhere_else():
 
 @pytest.mark.parametrize('bits, dtype', [(8, np.uint8), (10, np.uint16), (12, np.uint16), (16, np.uint16)])
 def test_bits_are_the_full_scale(bits, dtype):
-    image = imaging.show(np.array([[0.0, 2.0]], np.float32), dataclasses.replace(PLAIN, bits=bits), Levels(1.0, 0.4, 1.25))
+    image = imaging.show(np.array([[0.0, 2.0]], np.float32), dataclasses.replace(PLAIN, bits=bits),
+                         Levels(1.0, 0.4, 1.25))
     assert image.dtype == dtype and image.tolist() == [[0, 2**bits - 1]]
 
 
@@ -102,7 +105,8 @@ def test_draws_lie_in_their_ranges_and_differ():
     assert imaging.draw(np.random.default_rng(3)) == drawn[3]
 
 
-@pytest.mark.parametrize('wrong', [dict(display='film'), dict(bits=0), dict(bits=17), dict(photons=0), dict(scatter=1.0), dict(lag=1.0), dict(gamma=0),
+@pytest.mark.parametrize('wrong', [dict(display='film'), dict(bits=0), dict(bits=17), dict(photons=0),
+                                   dict(scatter=1.0), dict(lag=1.0), dict(gamma=0),
                                    dict(blur_px=-1), dict(black=0.5, white=-0.5)])
 def test_impossible_imaging_is_refused(wrong):
     with pytest.raises(ValueError, match='no (display|imaging)'):
@@ -119,4 +123,5 @@ def test_the_display_is_monotone_in_what_is_detected():
 def test_noise_free_detection_is_linear():
     chain = imaging.draw(np.random.default_rng(1))
     a, b = spot(0.2), cv2.GaussianBlur(spot(0.7), (0, 0), 5)
-    assert_allclose(imaging.spread(2 * a + b, chain), 2 * imaging.spread(a, chain) + imaging.spread(b, chain), rtol=1e-4)
+    assert_allclose(imaging.spread(2 * a + b, chain), 2 * imaging.spread(a, chain) + imaging.spread(b, chain),
+                    rtol=1e-4)

@@ -24,7 +24,8 @@ def mixed():
 def plain(mixed):
     """The same without anything that goes wrong."""
     chains = tuple(dataclasses.replace(c, imaging=dataclasses.replace(c.imaging, lag=0.0)) for c in mixed.run.chains)
-    return dataclasses.replace(mixed, before=None, wire=None, bolus=None, dark=None, run=dataclasses.replace(mixed.run, chains=chains))
+    return dataclasses.replace(mixed, before=None, wire=None, bolus=None, dark=None,
+                               run=dataclasses.replace(mixed.run, chains=chains))
 
 
 def images(stream, count):
@@ -52,7 +53,8 @@ def test_the_tip_is_no_faster_than_is_said_and_the_base_stays(kind, rate, limit)
 def test_the_load_swings_the_tip(mixed):
     """Beside the same motion without it, as far to one side as to the other."""
     still = dataclasses.replace(mixed.motion, load=np.zeros(3))
-    off = np.array([mixed.motion.backbone(t, 2e-3)[-1] - still.backbone(t, 2e-3)[-1] for t in np.arange(0, 1, 0.05) / mixed.motion.rounds])
+    off = np.array([mixed.motion.backbone(t, 2e-3)[-1] - still.backbone(t, 2e-3)[-1]
+                    for t in np.arange(0, 1, 0.05) / mixed.motion.rounds])
     along = off @ (off[np.linalg.norm(off, axis=1).argmax()] / np.linalg.norm(off, axis=1).max())
     assert 0.5e-3 < -along.min() and along.max() < 0.013
 
@@ -63,7 +65,8 @@ def test_the_load_swings_the_tip(mixed):
 def test_the_same_seed_is_the_same_stream_but_for_the_faults_of_its_kind(mixed, plain):
     again = streams.draw(3, 'plain')
     assert again.said() == mixed.said() and again.rate == mixed.rate
-    assert again.before is again.wire is again.bolus is again.dark is None and not any(c.imaging.lag for c in again.run.chains)
+    assert (again.before is again.wire is again.bolus is again.dark is None
+            and not any(c.imaging.lag for c in again.run.chains))
     lit = dataclasses.replace(plain, backgrounds=tuple(b.shifted((0, 0)) for b in plain.backgrounds))
     for image, other in zip(next(again.pairs(1)).scene.frame.images, next(lit.pairs(1)).scene.frame.images):
         assert_array_equal(image, other)
@@ -86,7 +89,8 @@ def test_stamps_and_noise_go_on(plain):
 
 
 def test_kinds_have_their_faults_and_no_others(mixed):
-    faulty = {'lag': lambda s: any(c.imaging.lag for c in s.run.chains), 'stale_mask': lambda s: s.before is not None, 'wire': lambda s: s.wire is not None,
+    faulty = {'lag': lambda s: any(c.imaging.lag for c in s.run.chains), 'stale_mask': lambda s: s.before is not None,
+              'wire': lambda s: s.wire is not None,
               'dark': lambda s: s.dark is not None, 'bolus': lambda s: s.bolus is not None}
     assert all(has(mixed) for has in faulty.values())
     assert set(streams.KINDS) == {'plain', 'mixed', *faulty}
@@ -101,22 +105,28 @@ def test_kinds_have_their_faults_and_no_others(mixed):
 
 def test_a_dark_plane_is_dark_for_a_second_and_shows_nothing(plain, monkeypatch):
     dark = faults.Dark(1, 0.5)
-    assert [k for k in range(60) if dark.at(k / 15)] == list(range(8, 23)) and sum(dark.at(k / 30) for k in range(60)) == 30
+    assert ([k for k in range(60) if dark.at(k / 15)] == list(range(8, 23))
+            and sum(dark.at(k / 30) for k in range(60)) == 30)
     monkeypatch.setattr(faults, 'DARK_S', 1 / plain.rate)       # one pair
     lit, dim = images(plain, 3), list(dataclasses.replace(plain, dark=faults.Dark(1, 1 / plain.rate)).pairs(3))
     assert [m.shown for m in dim] == [True, False, True]
-    assert np.ptp(dim[1].scene.frame.images[1]) == 0 and dim[1].scene.frame.images[1].max() <= np.percentile(lit[0][1], 1)
+    assert (np.ptp(dim[1].scene.frame.images[1]) == 0
+            and dim[1].scene.frame.images[1].max() <= np.percentile(lit[0][1], 1))
     for k, plane in ((0, 0), (0, 1), (1, 0), (2, 0), (2, 1)):
         assert_array_equal(dim[k].scene.frame.images[plane], lit[k][plane])
 
 
 def test_lag_leaves_a_ghost_that_a_dark_pair_ends(plain, monkeypatch):
-    """With nothing but the share of the image before: what is shown is linear in what is detected, and averaging begins anew after the dark."""
+    """With nothing but the share of the image before: what is shown is linear in what is detected, and averaging begins
+    anew after the dark."""
     monkeypatch.setattr(faults, 'DARK_S', 1 / plain.rate)
-    chains = tuple(dataclasses.replace(c, imaging=dataclasses.replace(c.imaging, display='linear', sharpening=0.0, bits=16, black=-0.8, white=0.5)) for c in plain.run.chains)
+    chains = tuple(dataclasses.replace(c, imaging=dataclasses.replace(c.imaging, display='linear', sharpening=0.0,
+                                                                      bits=16, black=-0.8, white=0.5))
+                   for c in plain.run.chains)
     linear = dataclasses.replace(plain, run=dataclasses.replace(plain.run, chains=chains))
     chains = tuple(dataclasses.replace(c, imaging=dataclasses.replace(c.imaging, lag=0.4)) for c in chains)
-    lagging = dataclasses.replace(linear, run=dataclasses.replace(plain.run, chains=chains), dark=faults.Dark(1, 2 / plain.rate))
+    lagging = dataclasses.replace(linear, run=dataclasses.replace(plain.run, chains=chains),
+                                  dark=faults.Dark(1, 2 / plain.rate))
     now, shown = images(linear, 4), images(lagging, 4)
     open_ = [(i > 0) & (i < 65535) for i in now[0]], [(i > 0) & (i < 65535) for i in now[1]]
     for plane in (0, 1):
@@ -130,7 +140,8 @@ def test_lag_leaves_a_ghost_that_a_dark_pair_ends(plain, monkeypatch):
 def test_a_mask_shows_the_patient_before_he_moved_and_no_device(mixed, plain):
     assert plain.mask(8) == []
     taken = mixed.mask(2)
-    assert len(taken) == 2 and all(isinstance(f, Frame) for f in taken) and not np.array_equal(taken[0].images[0], taken[1].images[0])
+    assert (len(taken) == 2 and all(isinstance(f, Frame) for f in taken)
+            and not np.array_equal(taken[0].images[0], taken[1].images[0]))
     for before, now in zip(mixed.before, mixed.backgrounds):
         assert before.moved_px == (0.0, 0.0) and 2 <= np.hypot(*now.moved_px) <= 5
         assert_array_equal(before.picture, now.picture)
@@ -155,7 +166,8 @@ def test_a_bolus_darkens_a_part_of_the_field_for_two_seconds(plain):
     assert all(bolus.share(begins + t) > 0 for t in (0.1, 1, 1.9)) and bolus.share(0) == bolus.share(9) == 0
     for depth in bolus.depths:
         assert 0.29 < depth.max() < 0.81 and (depth > 0.5 * depth.max()).mean() < 0.3
-    now, later = images(plain, 1)[0], images(dataclasses.replace(plain, bolus=dataclasses.replace(bolus, begins_s=-0.5)), 1)[0]
+    now, later = (images(plain, 1)[0],
+                  images(dataclasses.replace(plain, bolus=dataclasses.replace(bolus, begins_s=-0.5)), 1)[0])
     for i, (before, after) in enumerate(zip(now, later)):
         dense = (bolus.depths[i] > 0.6 * bolus.depths[i].max()) & (before > 0)
         if plain.apertures[i] is not None:
@@ -164,12 +176,14 @@ def test_a_bolus_darkens_a_part_of_the_field_for_two_seconds(plain):
 
 
 def test_a_stream_before_a_ct():
-    """A block of water that fills the field, from an edge of which the device keeps away: it lets so much through as the water that it is."""
+    """A block of water that fills the field, from an edge of which the device keeps away: it lets so much through as
+    the water that it is."""
     volume = ct.Volume(np.zeros((60, 60, 60), np.int16), np.full(3, 3e-3))
     drawn = streams.draw(0, 'plain', volume)
     for b, chain in zip(drawn.backgrounds, drawn.run.chains):
         passed = b.at(0.0)[streams.SIZE_PX // 2, streams.SIZE_PX // 2]
-        assert 0.12 < -np.log(passed) / water_attenuation(chain.imaging.energy_kev) < 0.32       # m: 0.18 m across, and slanting
+        # m: 0.18 m across, and slanting
+        assert 0.12 < -np.log(passed) / water_attenuation(chain.imaging.energy_kev) < 0.32
 
 
 def test_another_kind_is_refused_by_name():

@@ -23,7 +23,7 @@ def wide():
 def test_geometry_is_drawn_from_its_ranges(wide):
     for run in wide:
         views = [f.view for f in run.fields]
-        assert variety.BETWEEN[0] - 0.6 < plane_angle(views) < variety.BETWEEN[1] + 0.6     # secondary angles come on top
+        assert variety.BETWEEN[0] - 0.6 < plane_angle(views) < variety.BETWEEN[1] + 0.6   # secondary angles come on top
         sizes = [1 / pixels_per_metre(v.P, np.zeros((1, 3))) for v in views]
         assert 0.9 * variety.PIXELS[0] < min(sizes) and max(sizes) < 1.15 * variety.PIXELS[1] and sizes[0] != sizes[1]
         assert variety.RADII[0] <= run.radius <= variety.RADII[1]
@@ -45,7 +45,8 @@ def test_what_is_drawn_can_be_seen(wide):
 
 def test_visibility_grows_with_the_dose_as_its_root(wide):
     run = wide[0]
-    more = dataclasses.replace(run, chains=tuple(dataclasses.replace(c, imaging=dataclasses.replace(c.imaging, photons=4 * c.imaging.photons)) for c in run.chains))
+    more = dataclasses.replace(run, chains=tuple(dataclasses.replace(c, imaging=dataclasses.replace(
+        c.imaging, photons=4 * c.imaging.photons)) for c in run.chains))
     signal, darker = variety.visibility(run)
     assert_allclose(variety.visibility(more), [2 * signal, darker], rtol=1e-5)
 
@@ -55,13 +56,16 @@ def test_truth_lies_on_the_darkest_ridge(wide):
     for run in wide:
         truth = run.scene().truth
         for i, chain in enumerate(run.chains):
-            shown = imaging.show(imaging.detect(run.sharp(run.backbone(), i), dataclasses.replace(chain.imaging, bits=16), chain.levels, None),
-                                 dataclasses.replace(chain.imaging, bits=16, sharpening=0.0), chain.levels).astype(float)
+            shown = imaging.show(imaging.detect(run.sharp(run.backbone(), i),
+                                                dataclasses.replace(chain.imaging, bits=16), chain.levels, None),
+                                 dataclasses.replace(chain.imaging, bits=16, sharpening=0.0),
+                                 chain.levels).astype(float)
             uv = project(run.fields[i].view.P, truth)[20:-20:20]
             along = np.gradient(uv, axis=0)
             across = np.c_[-along[:, 1], along[:, 0]] / np.linalg.norm(along, axis=1, keepdims=True)
             aside = 3 * run.radius * pixels_per_metre(run.fields[i].view.P, truth) + 3 * chain.imaging.blur_px
-            on, off = (cv2.remap(shown.astype(np.float32), *(uv + d * across).astype(np.float32).T[:, :, None], cv2.INTER_LINEAR) for d in (0.0, aside))
+            on, off = (cv2.remap(shown.astype(np.float32), *(uv + d * across).astype(np.float32).T[:, :, None],
+                                 cv2.INTER_LINEAR) for d in (0.0, aside))
             assert (on < off).mean() > 0.9
 
 
@@ -100,13 +104,16 @@ def test_lag_drags_a_ghost_and_without_it_nothing_changes():
     by_hand = run.shown(tuple(0.5 * a + 0.5 * b for a, b in zip(first, second)))
     for image, expected, now in zip(averaged[1].frame.images, by_hand.images, run.scene(2.0, 1).frame.images):
         assert np.abs(image.astype(int) - expected).max() <= 1
-        assert (image < now.astype(int) - 6).sum() > 20       # the noise is one level; where the device was, half of it is left
-    sharp = scenes.xray_run(2, views=SMALL, lengths=(0.067, 0.1), anatomy=False, radius=0.002, chains=(dataclasses.replace(chain, lag=0.0),) * 2)
+        # the noise is one level; where the device was, half of it is left
+        assert (image < now.astype(int) - 6).sum() > 20
+    sharp = scenes.xray_run(2, views=SMALL, lengths=(0.067, 0.1), anatomy=False, radius=0.002,
+                            chains=(dataclasses.replace(chain, lag=0.0),) * 2)
     assert_array_equal(next(scenes.moving(sharp, 2.0, 1)).frame.images[0], sharp.scene().frame.images[0])
 
 
 def test_device_alone_means_fluoroscopy_and_a_rod_is_that_of_the_exposure():
-    run = scenes.xray_run(1, views=SMALL, lengths=(0.067, 0.1), anatomy=False, radius=0.001, chains=(imaging.SETTINGS['cine'],) * 2)
+    run = scenes.xray_run(1, views=SMALL, lengths=(0.067, 0.1), anatomy=False, radius=0.001,
+                          chains=(imaging.SETTINGS['cine'],) * 2)
     # at REFERENCE_KEV the rod takes away a quarter where the beam crosses its axis
     assert_allclose(1 - np.exp(-2 * run.radius * run.device.segments[0].material), 0.25)
     assert arc_length(run.backbone())[-1] < 0.11

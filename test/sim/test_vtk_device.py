@@ -34,20 +34,23 @@ def test_a_plain_rod_is_what_coverage_draws():
 
 
 def test_a_lumen_is_not_seen_from_outside():
-    solid, hollow = (vtk_scene.device_coverage(rod(), Device((Segment(REST, 0.001, 'metal', lumen),)), VIEW) for lumen in (0.0, 0.0008))
+    solid, hollow = (vtk_scene.device_coverage(rod(), Device((Segment(REST, 0.001, 'metal', lumen),)), VIEW)
+                     for lumen in (0.0, 0.0008))
     assert (solid == hollow).all()
 
 
 def test_area_is_that_of_all_parts():
     """Each part that stands out adds its own rectangle; where a band sits the shaft is hidden."""
-    bands = (Ring(0.002, 0.0015, 0.0014, 'platinum'), Ring(0.010, 0.002, 0.0018, 'platinum', every=0.006))       # the latter at 10, 16, 22 and 28 mm
+    # the latter at 10, 16, 22 and 28 mm
+    bands = (Ring(0.002, 0.0015, 0.0014, 'platinum'), Ring(0.010, 0.002, 0.0018, 'platinum', every=0.006))
     shadow = vtk_scene.device_coverage(rod(), Device((Segment(REST, 0.0008, 'metal'),), bands), VIEW)
     area = 2 * 0.0008 * 0.030 + 2 * (0.0014 - 0.0008) * 0.0015 + 4 * 2 * (0.0018 - 0.0008) * 0.002
     assert shadow.sum() * PX**2 == pytest.approx(area, rel=0.01)
 
 
 def test_a_step_is_where_the_device_has_it():
-    """The tip, at x = +15 mm, is to the left: the outline widens 12.2 mm to the right of it, from 7 to 11 px on either side of the middle row."""
+    """The tip, at x = +15 mm, is to the left: the outline widens 12.2 mm to the right of it, from 7 to 11 px on either
+    side of the middle row."""
     widths = vtk_scene.device_coverage(rod(), STEP, VIEW).sum(axis=0)
     tip, step, base = 199.5 - 75, 199.5 - 75 + 61, 199.5 + 75
     u = np.arange(400)
@@ -55,7 +58,8 @@ def test_a_step_is_where_the_device_has_it():
     assert widths[(u > step + 1) & (u < base - 1)] == pytest.approx(11, rel=0.01)
     assert not widths[u < tip - 1].any() and not widths[u > base + 1].any()
     thin, thick = np.median(widths[130:180]), np.median(widths[200:260])
-    # so many columns are thick, in parts, from the middle of the image back to the step, and so many are thin before column 150
+    # so many columns are thick, in parts, from the middle of the image back to the step, and so many are thin before
+    # column 150
     assert 199.5 - (widths[150:200] - thin).sum() / (thick - thin) == pytest.approx(step, abs=0.05)
     # the rim of the end is up to 0.7 mm nearer to the source than the axis: 75 px become 75.06
     assert 149.5 - widths[:150].sum() / thin == pytest.approx(tip - 0.03, abs=0.04)

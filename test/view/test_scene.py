@@ -28,7 +28,8 @@ def test_sources_stand_where_the_planes_look_from_and_detectors_behind_the_isoce
     np.testing.assert_allclose(numbers(shown['source_a'].positions), [[0.0, -0.8, 0.0]], atol=1e-6)
     np.testing.assert_allclose(numbers(shown['source_b'].positions), [[-0.8, 0.0, 0.0]], atol=1e-6)
     outline, *edges = lines(shown['detector_a'])
-    np.testing.assert_allclose(outline[:, 1], 0.8 * (scene.DETECTOR_AT - 1), atol=1e-6)     # behind it, and parallel to the image
+    # behind it, and parallel to the image
+    np.testing.assert_allclose(outline[:, 1], 0.8 * (scene.DETECTOR_AT - 1), atol=1e-6)
     half = SIZE / 2 * scene.DETECTOR_AT * 1e-3      # a pixel is 1 mm at the isocentre
     assert np.abs(outline[:, [0, 2]]).max() == pytest.approx(half, abs=1e-6) and len(edges) == 4
     np.testing.assert_allclose(project(A.P, outline[[0, 2]]), [[-0.5, -0.5], [SIZE - 0.5] * 2], atol=1e-3)
@@ -50,7 +51,8 @@ def test_a_mirrored_image_is_shown_but_not_on_its_detector():
     np.testing.assert_allclose(numbers(shown['source_a'].positions), [[0.0, -0.8, 0.0]], atol=1e-6)
 
 
-@pytest.mark.parametrize('P, up', [(VIEWS[0], 'RIGHT_HAND_Z_UP'), (np.c_[np.diag([800.0, 800.0, 1.0]), np.zeros(3)], 'RIGHT_HAND_Y_DOWN')])
+@pytest.mark.parametrize('P, up', [(VIEWS[0], 'RIGHT_HAND_Z_UP'),
+                                   (np.c_[np.diag([800.0, 800.0, 1.0]), np.zeros(3)], 'RIGHT_HAND_Y_DOWN')])
 def test_up_is_what_is_up_in_the_image(P, up):
     assert scene.upright(make_view('a', P, SIZE, SIZE))[''] is getattr(scene.rr.ViewCoordinates, up)
 
@@ -77,7 +79,8 @@ def test_the_ring_and_the_ellipse_of_the_tip_in_an_image():
     ring, ellipse = lines(scene.drawn_tip(A, np.zeros(3), 1e-6 * np.eye(3))['plane_a/tip'])
     center = (SIZE - 1) / 2
     np.testing.assert_allclose(np.linalg.norm(ring - center, axis=1), scene.RING_PX, atol=1e-3)
-    np.testing.assert_allclose(np.linalg.norm(ellipse - center, axis=1), np.sqrt(5.991465), atol=1e-3)     # sigma is 1 mm, which is 1 px; two degrees of freedom
+    # sigma is 1 mm, which is 1 px; two degrees of freedom
+    np.testing.assert_allclose(np.linalg.norm(ellipse - center, axis=1), np.sqrt(5.991465), atol=1e-3)
 
 
 def test_the_close_up_shows_the_last_millimetres_from_the_tip():
@@ -100,4 +103,5 @@ def test_numbers_that_are_not_known_are_left_out():
 
 def test_every_outcome_has_a_colour_and_nodes_have_tabs_of_their_own():
     assert {f'pairs/{outcome.value}' for outcome in scene.Outcome} <= scene.styles().keys()
-    assert [type(scene.layout(roots).root_container).__name__ for roots in (['one'], ['one', 'two'])] == ['Vertical', 'Tabs']
+    assert ([type(scene.layout(roots).root_container).__name__ for roots in (['one'], ['one', 'two'])]
+            == ['Vertical', 'Tabs'])

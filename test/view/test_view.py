@@ -34,7 +34,8 @@ DOMAIN = 1 + 2 * (os.getpid() % 50)
 S = np.linspace(0.0, arc_length(curve())[-1], 50)
 SHAPE = Shape(at_arc_length(curve(), S), S, np.tile(1e-8 * np.eye(3), (50, 1, 1)), np.zeros((50, 2)))
 PAIR = tuple(make_view(name, P, SIZE, SIZE) for name, P in zip('ab', VIEWS))
-BOTH = ('plane_a', 'plane_a/picture', 'plane_b', 'plane_b/picture', 'source_a', 'source_b', 'detector_a', 'device/backbone', 'device/ellipsoid', 'tip/ellipsoid',
+BOTH = ('plane_a', 'plane_a/picture', 'plane_b', 'plane_b/picture', 'source_a', 'source_b', 'detector_a',
+        'device/backbone', 'device/ellipsoid', 'tip/ellipsoid',
         'confidence/published', 'millimetres/tip_sigma', 'pairs/ok', 'log')
 
 
@@ -58,8 +59,8 @@ def bag(tmp_path_factory):
 
 def rows(path, tmp_path):
     """The rows of every entity in an .rrd file, as Rerun's own program reads it."""
-    done = subprocess.run([sys.executable, '-m', 'rerun_cli', 'rrd', 'print', str(path)], capture_output=True, text=True, timeout=120,
-                          env={**os.environ, 'XDG_CONFIG_HOME': str(tmp_path)})
+    done = subprocess.run([sys.executable, '-m', 'rerun_cli', 'rrd', 'print', str(path)], capture_output=True,
+                          text=True, timeout=120, env={**os.environ, 'XDG_CONFIG_HOME': str(tmp_path)})
     assert done.returncode == 0, done.stderr
     found = Counter()
     for count, entity in re.findall(r'with (\d+) rows .* - /(\S+) - ', done.stdout):
@@ -73,27 +74,34 @@ def rows(path, tmp_path):
 def test_results_with_images_become_a_file_that_rerun_reads(bag, tmp_path):
     assert main.main(['--bag', str(bag), '--save', str(tmp_path / 'all.rrd')]) == 0
     found = rows(tmp_path / 'all.rrd', tmp_path)
-    assert {f'fluoro_shape/{path}' for path in BOTH} | {'fluoro_shape/plane_a/backbone', 'fluoro_shape/plane_b/tip', 'fluoro_shape/pairs/no_device_in_plane_a'} <= found.keys()
-    assert 'fluoro_shape/milliseconds/node' in found and found['fluoro_shape/milliseconds/node'] <= 2       # its style alone: a replay has no latency
+    assert {f'fluoro_shape/{path}' for path in BOTH} | {'fluoro_shape/plane_a/backbone', 'fluoro_shape/plane_b/tip',
+                                                        'fluoro_shape/pairs/no_device_in_plane_a'} <= found.keys()
+    # its style alone: a replay has no latency
+    assert 'fluoro_shape/milliseconds/node' in found and found['fluoro_shape/milliseconds/node'] <= 2
 
 
 def test_without_images_there_are_only_results(bag, tmp_path):
     assert main.main(['--bag', str(bag), '--save', str(tmp_path / 'bare.rrd'), '--no-images']) == 0
     found = rows(tmp_path / 'bare.rrd', tmp_path)
-    assert {'fluoro_shape/device/backbone', 'fluoro_shape/source_a'} <= found.keys() and not [path for path in found if path.endswith('/picture')]
+    assert ({'fluoro_shape/device/backbone', 'fluoro_shape/source_a'} <= found.keys()
+            and not [path for path in found if path.endswith('/picture')])
 
 
 def test_topics_are_found_in_namespaces_where_they_were_remapped_and_compressed():
-    cloud, path, image, small = 'sensor_msgs/msg/PointCloud2', 'nav_msgs/msg/Path', 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-    types = {'/lab/backbone_points': cloud, '/lab/ground_truth/backbone': path, '/lab/plane_a/overlay': image, '/lab/plane_a/image_raw': image,
-             '/lab/plane_b/image_raw/compressed': small, '/xray/frontal': image, '/backbone': path, '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray'}
+    cloud, path, image, small = ('sensor_msgs/msg/PointCloud2', 'nav_msgs/msg/Path', 'sensor_msgs/msg/Image',
+                                 'sensor_msgs/msg/CompressedImage')
+    types = {'/lab/backbone_points': cloud, '/lab/ground_truth/backbone': path, '/lab/plane_a/overlay': image,
+             '/lab/plane_a/image_raw': image, '/lab/plane_b/image_raw/compressed': small, '/xray/frontal': image,
+             '/backbone': path, '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray'}
     assert recorded.namespaces(types) == ['/', '/lab']
     always = {'/diagnostics': '/diagnostics'}
     assert recorded.topics_of('/lab', types, {}, True) == always | {
-        '/lab/backbone_points': 'backbone_points', '/lab/ground_truth/backbone': 'ground_truth/backbone', '/lab/plane_a/overlay': 'plane_a/overlay',
-        '/lab/plane_b/image_raw/compressed': 'plane_b/image_raw'}
-    assert recorded.topics_of('/', types, {'plane_a/image_raw': '/xray/frontal'}, True) == always | {'/backbone': 'backbone', '/xray/frontal': 'plane_a/image_raw'}
-    assert recorded.topics_of('/', types, {'plane_a/image_raw': '/xray/frontal'}, False) == always | {'/backbone': 'backbone'}
+        '/lab/backbone_points': 'backbone_points', '/lab/ground_truth/backbone': 'ground_truth/backbone',
+        '/lab/plane_a/overlay': 'plane_a/overlay', '/lab/plane_b/image_raw/compressed': 'plane_b/image_raw'}
+    assert (recorded.topics_of('/', types, {'plane_a/image_raw': '/xray/frontal'}, True)
+            == always | {'/backbone': 'backbone', '/xray/frontal': 'plane_a/image_raw'})
+    assert (recorded.topics_of('/', types, {'plane_a/image_raw': '/xray/frontal'}, False)
+            == always | {'/backbone': 'backbone'})
 
 
 def test_a_damaged_bag_is_shown_as_far_as_it_goes_and_named(bag, tmp_path, capsys):
@@ -143,9 +151,11 @@ def test_what_can_not_be_is_named(arguments, code, words, bag, tmp_path, capsys,
 
 @pytest.mark.parametrize('blocked, extra, arguments', [('rerun', 'view', ['--bag', 'any']), ('rclpy', 'ros', [])])
 def test_what_is_not_installed_is_named(blocked, extra, arguments):
-    code = f'import sys\nsys.modules[{blocked!r}] = None\nfrom fluoro_shape_ros.view.main import main\nsys.exit(main({arguments!r}))'
+    code = (f'import sys\nsys.modules[{blocked!r}] = None\nfrom fluoro_shape_ros.view.main import main\n'
+            f'sys.exit(main({arguments!r}))')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1 and done.stderr.count('\n') == 1 and f'fluoro_shape_ros[{extra}]' in done.stderr, done.stderr
+    assert (done.returncode == 1 and done.stderr.count('\n') == 1
+            and f'fluoro_shape_ros[{extra}]' in done.stderr), done.stderr
 
 
 # ---- topics
@@ -154,7 +164,8 @@ def test_what_is_not_installed_is_named(blocked, extra, arguments):
 @contextmanager
 def process(*arguments, domain=DOMAIN, **options):
     """fluoro_shape_view, ended with the block."""
-    child = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.view.main', *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    child = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.view.main', *map(str, arguments)],
+                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                              env={**os.environ, 'ROS_DOMAIN_ID': str(domain)}, **options)
     try:
         yield child
@@ -168,19 +179,24 @@ def test_nobody_there_is_said_in_one_line(tmp_path):
     pytest.importorskip('rclpy')
     with process('lab', 'other', '--wait', 1, '--save', tmp_path / 'a.rrd') as child:
         told, _ = child.communicate(timeout=100)
-    assert child.returncode == 1 and told.count('\n') == 1 and '/lab, /other' in told and not (tmp_path / 'a.rrd').exists()
+    assert (child.returncode == 1 and told.count('\n') == 1 and '/lab, /other' in told
+            and not (tmp_path / 'a.rrd').exists())
 
 
 def messages(stamp):
     """What a node with ground truth publishes of a good pair, by topic."""
     result = Reconstruction(Outcome.OK, shape=SHAPE, confidence=0.97)
     said = {'last outcome': 'ok', 'mask': 'none', LATENCY: '31.0', 'count ok': '5'}
-    told = {DIAGNOSTICS[0]: diagnostic_array([Status('reconstruction', OK, '5.0 results/s', said)], stamp, '/lab/fluoro_shape', ros_message),
-            'ground_truth/backbone': shape_to_path(SHAPE, stamp, 'world', ros_message), 'tip_pose': shape_to_tip_pose(SHAPE, stamp, 'world', ros_message),
+    told = {DIAGNOSTICS[0]: diagnostic_array([Status('reconstruction', OK, '5.0 results/s', said)], stamp,
+                                             '/lab/fluoro_shape', ros_message),
+            'ground_truth/backbone': shape_to_path(SHAPE, stamp, 'world', ros_message),
+            'tip_pose': shape_to_tip_pose(SHAPE, stamp, 'world', ros_message),
             'backbone_points': shape_to_cloud(SHAPE, 0.97, stamp, 'world', ros_message)}
     for k, (plane, calibration) in enumerate(zip('ab', CALIBRATIONS)):
-        told[f'plane_{plane}/camera_info'] = calibration_to_camera_info(calibration, stamp, f'plane_{plane}', ros_message)
-        told[f'plane_{plane}/overlay'] = array_to_image(overlay(GOOD[k], k, result, PAIR)[::2, ::2], stamp, 'world', ros_message)
+        told[f'plane_{plane}/camera_info'] = calibration_to_camera_info(calibration, stamp, f'plane_{plane}',
+                                                                        ros_message)
+        told[f'plane_{plane}/overlay'] = array_to_image(overlay(GOOD[k], k, result, PAIR)[::2, ::2], stamp, 'world',
+                                                        ros_message)
     return told
 
 
@@ -197,7 +213,8 @@ def test_a_node_is_shown_while_it_publishes(tmp_path):
         with process('lab', '--wait', 60, '--save', file) as child:
             deadline, sent = time.monotonic() + 60, 0
             # until more has been written than the styles and some pairs
-            while time.monotonic() < deadline and child.poll() is None and not (file.exists() and file.stat().st_size > 600_000):
+            while (time.monotonic() < deadline and child.poll() is None
+                   and not (file.exists() and file.stat().st_size > 600_000)):
                 sent += 1
                 for topic, message in messages(time.time_ns()).items():
                     publishers[topic].publish(message)
@@ -209,5 +226,6 @@ def test_a_node_is_shown_while_it_publishes(tmp_path):
         context.try_shutdown()
     assert child.returncode == 0 and '/lab is heard' in told and 'Traceback' not in told, (sent, told)
     found = rows(file, tmp_path)
-    assert {f'lab/{path}' for path in (*BOTH, 'truth', 'tip/truth', 'millimetres/tip_error', 'milliseconds/node', 'milliseconds/here')} <= found.keys()
+    assert {f'lab/{path}' for path in (*BOTH, 'truth', 'tip/truth', 'millimetres/tip_error', 'milliseconds/node',
+                                       'milliseconds/here')} <= found.keys()
     assert min(found[f'lab/{path}'] for path in ('plane_a/picture', 'device/backbone', 'truth')) > 1

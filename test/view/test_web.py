@@ -75,7 +75,8 @@ def ask(port, method, path, host=None, body=None):
 
 def test_the_page_is_told_to_speak_to_nobody_but_here(served):
     status, headers, start = ask(served, 'GET', '/?url=any')
-    assert (status, start) == (200, b'<html>the page</html>') and headers['content-security-policy'] == POLICY and headers['set-cookie'] is None
+    assert ((status, start) == (200, b'<html>the page</html>') and headers['content-security-policy'] == POLICY
+            and headers['set-cookie'] is None)
     assert "default-src 'self'" in POLICY and 'connect-src' not in POLICY and 'http' not in POLICY
 
 
@@ -89,14 +90,17 @@ def test_data_come_while_they_are_made_and_to_no_other_page(served):
     assert (status, start) == (200, b'first of all') and headers['access-control-allow-origin'] is None
 
 
-@pytest.mark.parametrize('method, path, host', [('POST', READ.replace('Read', 'Write'), None), ('POST', READ, 'elsewhere.example'), ('GET', '/', 'elsewhere.example'),
+@pytest.mark.parametrize('method, path, host', [('POST', READ.replace('Read', 'Write'), None),
+                                                ('POST', READ, 'elsewhere.example'), ('GET', '/', 'elsewhere.example'),
                                                 ('GET', '/?url=any', '')])
 def test_what_is_not_for_looking_is_refused(served, method, path, host):
     assert ask(served, method, path, ' ' if host == '' else host, b'x' if method == 'POST' else None)[0] == 403
 
 
-@pytest.mark.parametrize('host, known_here', [('127.0.0.1:9090', True), ('localhost', True), ('192.0.2.1:80', True), ('[::1]:9090', True), (f'{socket.gethostname()}:9090', True),
-                                              ('localhost.example:9090', False), ('127.0.0.1.example', False), ('', False)])
+@pytest.mark.parametrize('host, known_here', [('127.0.0.1:9090', True), ('localhost', True), ('192.0.2.1:80', True),
+                                              ('[::1]:9090', True), (f'{socket.gethostname()}:9090', True),
+                                              ('localhost.example:9090', False), ('127.0.0.1.example', False),
+                                              ('', False)])
 def test_names_that_others_can_give_this_machine_are_unknown(host, known_here):
     assert known(host) == known_here
 
@@ -117,11 +121,13 @@ def page(tmp_path_factory):
     folder, port = tmp_path_factory.mktemp('bag'), free_port()
     recording.record(folder / 'run', [GOOD])
     assert recording.main(folder / 'run', '--out', folder / 'results', '--with-images', '-p', BASE) == 0
-    child = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.view.main', '--bag', str(folder / 'results'), '--web', '--port', str(port)],
+    child = subprocess.Popen([sys.executable, '-m', 'fluoro_shape_ros.view.main', '--bag', str(folder / 'results'),
+                              '--web', '--port', str(port)],
                              stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         line = child.stdout.readline()
-        assert line.strip() == f'fluoro_shape_view: to be seen at {address(LOOPBACK, port)}', child.communicate(timeout=60)
+        assert (line.strip() == 'fluoro_shape_view: to be seen at '
+                                f'{address(LOOPBACK, port)}'), child.communicate(timeout=60)
         yield port, child
         child.send_signal(signal.SIGINT)
         _, told = child.communicate(timeout=60)
@@ -136,8 +142,10 @@ def listening(pid):
     """The local addresses, as /proc writes them, at which a process or a child of it listens."""
     pids, inodes = [pid], set()
     for number in pids:
-        pids += [int(child) for task in os.listdir(f'/proc/{number}/task') for child in open(f'/proc/{number}/task/{task}/children').read().split()]
-        inodes |= {os.readlink(f'/proc/{number}/fd/{fd}') for fd in os.listdir(f'/proc/{number}/fd') if os.path.islink(f'/proc/{number}/fd/{fd}')}
+        pids += [int(child) for task in os.listdir(f'/proc/{number}/task')
+                 for child in open(f'/proc/{number}/task/{task}/children').read().split()]
+        inodes |= {os.readlink(f'/proc/{number}/fd/{fd}') for fd in os.listdir(f'/proc/{number}/fd')
+                   if os.path.islink(f'/proc/{number}/fd/{fd}')}
     tables = [line.split() for name in ('tcp', 'tcp6') for line in open(f'/proc/net/{name}').read().splitlines()[1:]]
     return {row[1].split(':')[0] for row in tables if row[3] == '0A' and f'socket:[{row[9]}]' in inodes}
 
@@ -160,7 +168,8 @@ def test_a_browser_draws_it_and_asks_nobody_else(page, tmp_path):
     port, _ = page
     with LivePage(f'http://{LOOPBACK}:{port}/', tmp_path) as browser:
         # Rerun shows its canvas once it can draw
-        assert browser.until("document.getElementById('the_canvas_id')?.classList.contains('visible')"), browser.evaluate('document.body.innerText')
+        assert browser.until("document.getElementById('the_canvas_id')?.classList.contains('visible')"), (
+            browser.evaluate('document.body.innerText'))
         assert browser.wait(lambda: any(url.endswith(READ) for url in browser.requested))
         assert 'crashed' not in browser.evaluate('document.body.innerText')
     assert {url for url in browser.requested if not re.match(f'http://{LOOPBACK}:{port}/|blob:|data:', url)} == set()

@@ -1,4 +1,5 @@
-"""Where along the curve the device is, and exactly where it ends: an edge along the axis, solved in both planes at once."""
+"""Where along the curve the device is, and exactly where it ends: an edge along the axis, solved in both planes at
+once."""
 
 from __future__ import annotations
 
@@ -14,30 +15,37 @@ BRIDGED_PX = 70         # a stretch that not both planes show does not end the d
 SMOOTH_PX = 9           # along which darkness is averaged
 LOCAL_PX = 27           # at an end, that tell how dark the device is there
 PALEST = 0.03           # of the usual darkness: a paler device is not told from a background that is no parabola
-ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not within so many px
+ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not
+                                # within so many px
 BAND, SOFT_TIP = 3e-3, 2e-3     # m: longest marker band, and farthest that a device goes on past one at its end
-SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing is seen, since it may be pale
+SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing
+                                # is seen, since it may be pale
 REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
 OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
-RAMP = 0.3              # of the length over which an end fades in a plane, that its model is worth there: how opaque it looks depends on the display
+RAMP = 0.3              # of the length over which an end fades in a plane, that its model is worth there: how opaque it
+                        # looks depends on the display
 DISAGREE = 3.0          # standard deviations by which the planes' ends may differ
 FLOOR_PX = 0.22         # what the model of the edge itself is worth in a plane
 
 
 def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1) -> np.ndarray:
-    """(N,) nats by which each strip of (2, N) presence (NaN: outside the field) speaks for a device that both planes show, about `step_px` apart.
+    """(N,) nats by which each strip of (2, N) presence (NaN: outside the field) speaks for a device that both planes
+    show, about `step_px` apart.
 
-    clutter: (2, N) or (2, 1) how dark places beside the device happen to look over SMOOTH_PX. What a single plane shows may be another line: the other counts.
+    clutter: (2, N) or (2, 1) how dark places beside the device happen to look over SMOOTH_PX. What a single plane shows
+    may be another line: the other counts.
     """
     least = np.maximum(_both_show(presence / np.maximum(clutter, PALEST), max(SMOOTH_PX // step_px, 1)), 0.0)
     return (np.minimum(0.5 * least * least, SURE) - ABSENT) * (step_px / SMOOTH_PX)
 
 
-def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1, gap_px: float = BRIDGED_PX) -> tuple[int, int] | None:
-    """First and last index of the device's stretch of (N, 2) presence, the one that most `evidence` speaks for, to where it is PRESENT of as dark as near
-    that end; None where there is none. Bands beyond a pale stretch no longer than `gap_px` belong to it, if they are clear enough."""
+def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1,
+              gap_px: float = BRIDGED_PX) -> tuple[int, int] | None:
+    """First and last index of the device's stretch of (N, 2) presence, the one that most `evidence` speaks for, to
+    where it is PRESENT of as dark as near that end; None where there is none. Bands beyond a pale stretch no longer
+    than `gap_px` belong to it, if they are clear enough."""
     nats = evidence(presence.T, clutter, step_px)
     seen = np.nonzero(nats > 0)[0]
     for k in np.nonzero(np.diff(seen) * step_px > gap_px)[0]:
@@ -57,7 +65,8 @@ def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1, gap_p
 
 
 def level(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, float]:
-    """(2,) darkness of the device at an end in each plane, and how far inside that it stays so, in the units of `inward`: a band, or a pale tip, may be short.
+    """(2,) darkness of the device at an end in each plane, and how far inside that it stays so, in the units of
+    `inward`: a band, or a pale tip, may be short.
 
     presence: (2, N); inward: (N,) how far inside the end each strip lies; px: a pixel in these units.
     """
@@ -78,11 +87,14 @@ def level(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarr
     return np.maximum(dark_here, PALEST), float(inner)
 
 
-def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: np.ndarray, px: float) -> tuple[float, float]:
-    """m by which the device goes on past a dark band that seems to be its end, and the standard deviation of that: a pale tip is often hardly seen.
+def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: np.ndarray,
+              px: float) -> tuple[float, float]:
+    """m by which the device goes on past a dark band that seems to be its end, and the standard deviation of that: a
+    pale tip is often hardly seen.
 
-    presence: (2, N) at (N,) m inside the band's outer edge; inner: m, the band's length; clutter: (2,) see `evidence`. Posterior mean over lengths up to
-    SOFT_TIP, half of the prior on none, of a tip as dark as the device is behind the band. (0, 0) where there is no band.
+    presence: (2, N) at (N,) m inside the band's outer edge; inner: m, the band's length; clutter: (2,) see `evidence`.
+    Posterior mean over lengths up to SOFT_TIP, half of the prior on none, of a tip as dark as the device is behind the
+    band. (0, 0) where there is no band.
     """
     behind, past = (inward > inner + 2 * px) & (inward < inner + LOCAL_PX * px), inward < -px
     if inner > BAND or behind.sum() < 6 or past.sum() < 6:
@@ -103,7 +115,8 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
 
 
 def _both_show(presence: np.ndarray, strips: int) -> np.ndarray:
-    """(N,) darkness that both planes show at least, of (2, N) presence averaged over so many strips: what only one shows is another line."""
+    """(N,) darkness that both planes show at least, of (2, N) presence averaged over so many strips: what only one
+    shows is another line."""
     return cv2.blur(_known(presence), (strips, 1), borderType=cv2.BORDER_REPLICATE).min(axis=0)
 
 
@@ -115,10 +128,10 @@ def _known(presence: np.ndarray) -> np.ndarray:
 def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     """(2,) m by which the shadow of a flat end reaches beyond the axis' end in each plane, seen at an angle.
 
-    The end's rim is an ellipse. An opaque device shows all of it: r cos / sin of the angle between ray and axis, times 0.69 for a step fitted to it (0.785 on average
-    over the width, most of it near the middle).
-    A translucent one fades from r cos before the end to r cos after it and is half as dark (Beer-Lambert) a little past the middle. `contrast` (2,)
-    tells which.
+    The end's rim is an ellipse. An opaque device shows all of it: r cos / sin of the angle between ray and axis, times
+    0.69 for a step fitted to it (0.785 on average over the width, most of it near the middle).
+    A translucent one fades from r cos before the end to r cos after it and is half as dark (Beer-Lambert) a little past
+    the middle. `contrast` (2,) tells which.
     """
     sine = np.clip(speed / px_per_m, 0.2, 1.0)
     opaque = 0.69 * np.clip((contrast - OPAQUE[0]) / (OPAQUE[1] - OPAQUE[0]), 0.0, 1.0)
@@ -152,16 +165,19 @@ class End:
         return float(np.hypot(self.sigma, self.apart / 2)) if self.disagreed else self.sigma
 
 
-def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray, outward: np.ndarray, beyond: np.ndarray,
-           ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX, blurs_px: Sequence[float] = BLURS_PX, inner: np.ndarray | None = None) -> list[End]:
+def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.ndarray, guess: np.ndarray,
+           outward: np.ndarray, beyond: np.ndarray, ramp: np.ndarray, density: float = 1.0, reach_px: float = REACH_PX,
+           blurs_px: Sequence[float] = BLURS_PX, inner: np.ndarray | None = None) -> list[End]:
     """Where the device ends, for E ends at once.
 
-    s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,) +1 for an end at large s, -1 at
-    small. beyond: (E, 2) m, see `bulge`. ramp: (E, 2) m over which the end fades in each plane; its model is worth RAMP of that.
+    s: (E, N) m. presence: (E, 2, N), sigma: (E, 2) its noise, speed: (E, 2, N) px per m. guess: (E,) m. outward: (E,)
+    +1 for an end at large s, -1 at small. beyond: (E, 2) m, see `bulge`. ramp: (E, 2) m over which the end fades in
+    each plane; its model is worth RAMP of that.
     density: strips a px, so many of which are one observation. reach_px: how far from the guess it is looked for.
-    inner: (E,) m, how far inside the guess the device is as dark as at its end (`level`); as far as is looked by default.
-    Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over both planes, residuals
-    clipped at 3.5 sigma. Each plane counts by what its edge is worth, noise and model together.
+    inner: (E,) m, how far inside the guess the device is as dark as at its end (`level`); as far as is looked by
+    default.
+    Model: the blurred step a Phi((end + beyond - s) speed / blur), a and blur free in each plane; least squares over
+    both planes, residuals clipped at 3.5 sigma. Each plane counts by what its edge is worth, noise and model together.
     """
     e = np.arange(len(s))
     px_per_m = speed[e, :, np.abs(s - guess[:, None]).argmin(axis=1)].mean(axis=1)
@@ -169,15 +185,19 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     if inner is not None:
         near &= (guess[:, None] - s) * outward[:, None] < inner[:, None]
     at = np.minimum(near.argmax(axis=1)[:, None] + np.arange(near.sum(axis=1).max()), s.shape[1] - 1)
-    y, speed, s, near = presence[e[:, None], :, at].transpose(0, 2, 1), speed[e[:, None], :, at].transpose(0, 2, 1), s[e[:, None], at], near[e[:, None], at]
+    y, speed, s, near = (presence[e[:, None], :, at].transpose(0, 2, 1), speed[e[:, None], :, at].transpose(0, 2, 1),
+                         s[e[:, None], at], near[e[:, None], at])
     counted = near[:, None] & np.isfinite(y) & np.isfinite(sigma)[..., None]
     counted &= counted.sum(axis=2, keepdims=True) >= 12
     y = np.where(counted, y, 0.0)
-    weight = np.where(counted.any(axis=2), 1 / (density * np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), 0.02) ** 2), 0.0)        # (E, 2)
+    weight = np.where(counted.any(axis=2),
+                      1 / (density * np.maximum(np.where(np.isfinite(sigma), sigma, 0.0), 0.02) ** 2), 0.0)     # (E, 2)
 
     def edges(ends: np.ndarray, blur: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of edges at (E, C) `ends` with blurs (..., E, 2): (..., E, 2, C) cost and height, and (E, 2, C, n) px that each strip lies inside the device."""
-        z = ((outward[:, None, None] * (ends[:, :, None] - s[:, None]))[:, None] + beyond[..., None, None]) * speed[:, :, None]
+        """Of edges at (E, C) `ends` with blurs (..., E, 2): (..., E, 2, C) cost and height, and (E, 2, C, n) px that
+        each strip lies inside the device."""
+        z = (((outward[:, None, None] * (ends[:, :, None] - s[:, None]))[:, None] + beyond[..., None, None])
+             * speed[:, :, None])
         m = ndtr(z / blur[..., None, None]) * counted[:, :, None]
         a = np.clip((m @ y[..., None])[..., 0] / np.maximum(np.einsum('...n,...n->...', m, m), 1e-9), 0.5, 1.8)
         rest = y[:, :, None] - a[..., None] * m
@@ -185,7 +205,8 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
 
     def information(z: np.ndarray, a: np.ndarray, blur: np.ndarray) -> np.ndarray:
         """(E, 2) 1/m^2 that an edge tells: z (E, 2, n) px inside the device, its height and blur (E, 2)."""
-        slope = (a / (blur * np.sqrt(2 * np.pi)))[..., None] * np.exp(-0.5 * (z / blur[..., None]) ** 2) * speed * counted
+        slope = ((a / (blur * np.sqrt(2 * np.pi)))[..., None] * np.exp(-0.5 * (z / blur[..., None]) ** 2)
+                 * speed * counted)
         return (slope * slope).sum(axis=2) * weight
 
     both = e[:, None], np.arange(2)
@@ -198,7 +219,8 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     noise = 1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12)
     seen_sigma = np.sqrt(noise + model)
     counts = (noise / (noise + model))[:, :, None]      # the more foreshortened a plane sees the end, the less
-    fine = wide[e, (cost * counts).sum(axis=1).argmin(axis=1)][:, None] + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None]
+    fine = (wide[e, (cost * counts).sum(axis=1).argmin(axis=1)][:, None]
+            + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None])
     fine_cost, a, z = edges(fine, blur)
     fine_cost = (fine_cost * counts).sum(axis=1)
     k = fine_cost.argmin(axis=1)
@@ -207,15 +229,18 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     posterior = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     at = np.array([_lowest(f, c) for f, c in zip(fine, fine_cost)])
     spread = np.sqrt((posterior * (wide - at[:, None])**2).sum(axis=1) / posterior.sum(axis=1))
-    sigma = np.where(spread * px_per_m > COARSE_PX, np.maximum(sigma, spread), sigma)     # in noise the edge may be one of several
+    # in noise the edge may be one of several
+    sigma = np.where(spread * px_per_m > COARSE_PX, np.maximum(sigma, spread), sigma)
     ends = []
     for i in e:
         seen = weight[i] > 0
         if seen.any():
             seen_at = np.array([_lowest(wide[i], c) for c in cost[i]])
-            end = End(float(at[i]), float(sigma[i]), np.where(seen, seen_at, np.nan), np.where(seen, seen_sigma[i], np.nan))
+            end = End(float(at[i]), float(sigma[i]), np.where(seen, seen_at, np.nan),
+                      np.where(seen, seen_sigma[i], np.nan))
             if end.apart > np.hypot(*seen_sigma[i]) and not end.disagreed:
-                end = replace(end, at=float(seen_sigma[i]**-2 @ seen_at / (seen_sigma[i]**-2).sum()))      # of two edges the joint one is the sharper, not the better known
+                # of two edges the joint one is the sharper, not the better known
+                end = replace(end, at=float(seen_sigma[i]**-2 @ seen_at / (seen_sigma[i]**-2).sum()))
             ends.append(end)
         else:
             ends.append(End(float(guess[i]), float('inf'), np.full(2, np.nan), np.full(2, np.nan)))

@@ -1,7 +1,8 @@
 """The 3-D spline fitted to both images at once.
 
-Project the curve, cut strips across it in both images, see how far the device lies off in each, solve for the control points, repeat. Residuals
-are perpendicular and sub-pixel, no correspondence is needed any more, and the normal equations carry the covariance.
+Project the curve, cut strips across it in both images, see how far the device lies off in each, solve for the control
+points, repeat. Residuals are perpendicular and sub-pixel, no correspondence is needed any more, and the normal
+equations carry the covariance.
 """
 
 from __future__ import annotations
@@ -17,7 +18,18 @@ from ...geometry.cameras import depth, pixels_per_metre
 from ...geometry.curve import arc_length, middle
 from ...geometry.spline import Spline3, prolong, through
 from ...imaging.profiles import background, contrast_of, mean_profile, own_shadow, shadow, straight_on
-from ...imaging.strips import Measurement, Model, Sheet, Strips, clutter, cut, darkness_across, half_width_range, measure, search
+from ...imaging.strips import (
+    Measurement,
+    Model,
+    Sheet,
+    Strips,
+    clutter,
+    cut,
+    darkness_across,
+    half_width_range,
+    measure,
+    search,
+)
 from .ends import BLURS_PX, BRIDGED_PX, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
 from .neighbours import without_neighbours
 from .solver import EndRow, Layout, Solution, solve
@@ -33,15 +45,19 @@ EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked at once
 NEAR_END_PX = 8
 ASTRAY = 0.04           # px a px, that it may bend away past an end
 GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
-END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0    # strips around an end, and how far from the first guess it is looked for
-UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the ends tell something of it
+# strips around an end, and how far from the first guess it is looked for
+END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0
+UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the
+                        # ends tell something of it
 SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
-GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far past its ends
+GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far
+                                # past its ends
 GOES_ON_BOTH = 3.0      # nats of evidence past an end that make one look farther ...
 GOES_ON_ALONE = 0.6     # ... or darkness there in one plane alone, as a share of the usual ...
 GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
-BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another line may hide it ...
+BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another
+                                # line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
 CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
 HARD_PX = 1.0           # what an end is worth that only one plane shows, or that is hard to see in both
@@ -60,14 +76,19 @@ class Fit:
     s: np.ndarray               # (N,) m
     presence: np.ndarray        # (N, 2)
     offset_px: np.ndarray       # (N, 2) of the device from the fitted curve; NaN where not measured
-    across: np.ndarray          # (2,) share of the beam that the device takes at its middle, after blur, as if seen straight on (Beer-Lambert)
-    beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share of the device's
+    across: np.ndarray          # (2,) share of the beam that the device takes at its middle, after blur, as if seen
+                                # straight on (Beer-Lambert)
+    beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share
+                                # of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
     clutter: np.ndarray         # (2,) how dark places beside it happen to look, as a share of its darkness
     farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, see `_Pair.farther`
-    alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the other; -1: both tell
-    moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not come to rest
-    seen_at: np.ndarray | None = None       # (2, 2) m, where the first and the last end (rows) are by plane A, B alone; NaN where one does not tell well
+    alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the
+                                # other; -1: both tell
+    moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not
+                                # come to rest
+    seen_at: np.ndarray | None = None       # (2, 2) m, where the first and the last end (rows) are by plane A, B alone;
+                                            # NaN where one does not tell well
     seen_sigma: np.ndarray | None = None    # (2, 2) m
 
     def curve(self, count: int) -> np.ndarray:
@@ -75,11 +96,13 @@ class Fit:
         return self.spline(np.linspace(self.start, self.stop, count))
 
 
-def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = COARSE, beyond_px: float = EXTENSION_PX, clearing: bool = False) -> Fit | None:
+def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = COARSE, beyond_px: float = EXTENSION_PX,
+        clearing: bool = False) -> Fit | None:
     """A Fit that starts at (N, 3) points in m, known to a few px; None where the images show no device there.
 
-    radius: of the device, m. coarse: rounds that search for it a few px around; 0: one that measures where it is instead; None: none, and no Fit where it is
-    not within ASTRAY_PX. beyond_px: how far past both ends is looked at once. clearing: take the line beside the device away, if there is one; slower.
+    radius: of the device, m. coarse: rounds that search for it a few px around; 0: one that measures where it is
+    instead; None: none, and no Fit where it is not within ASTRAY_PX. beyond_px: how far past both ends is looked at
+    once. clearing: take the line beside the device away, if there is one; slower.
     """
     views = sheet.views
     scale = [pixels_per_metre(v.P, points) for v in views]
@@ -98,7 +121,8 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
         strips, measured = look(found, s, seen.within)
         solution = solve(seen.layout, found.spline, strips, measured, views, seen.within, agreed)
         before = found.curve(2)
-        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, farther, half_width, radius)
+        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, farther,
+                              half_width, radius)
         slid = np.linalg.norm(found.curve(2) - before, axis=1).max() / step      # in depth, which strips do not see
         found = replace(found, moved_px=max(found.moved_px, float(slid)))
     return _see_ends(look, found, ends, half_width, radius, seen.clutter)
@@ -146,8 +170,10 @@ class _Pair:
     def of(cls, sheet: Sheet, half_width: list[float], step: float, clearing: bool) -> _Pair:
         return cls(sheet, step, *_looks(*(round(100 * h) for h in half_width)), half_width if clearing else None)
 
-    def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int | None, fine: int, near: bool = False) -> _Seen | None:
-        """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is none."""
+    def settle(self, spline: Spline3, reference: tuple[float, float], coarse: int | None, fine: int,
+               near: bool = False) -> _Seen | None:
+        """The curve brought to rest on the device, which lies between two arc lengths in m; None where there is
+        none."""
         views = self.sheet.views
         if not spline.stop - spline.start < self.step * min(LONGEST_PX, sum(v.width + v.height for v in views)):
             return None     # it has left the images, or turns back and forth in them
@@ -157,7 +183,8 @@ class _Pair:
         for k in range(fine):
             strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
             within = (layout.s >= reference[0]) & (layout.s <= reference[1])
-            own = np.stack([own_shadow(p, b, within & i, e) for p, b, i, e in zip(strips.profiles, self.beside, strips.inside, self.template)])
+            own = np.stack([own_shadow(p, b, within & i, e)
+                            for p, b, i, e in zip(strips.profiles, self.beside, strips.inside, self.template)])
             model = Model.of(own, strips.offsets_px)
             measured = measure(strips, model, within)
             solution = solve(layout, spline, strips, measured, views, within)
@@ -170,18 +197,23 @@ class _Pair:
                 break
         return seen
 
-    def _approach(self, spline: Spline3, reference: tuple[float, float], coarse: int, near: bool) -> tuple[Spline3, tuple[float, float]]:
-        """The curve brought nearer to the device by so many rounds that search, or by one that measures, and between which arc lengths that lies, m."""
+    def _approach(self, spline: Spline3, reference: tuple[float, float], coarse: int,
+                  near: bool) -> tuple[Spline3, tuple[float, float]]:
+        """The curve brought nearer to the device by so many rounds that search, or by one that measures, and between
+        which arc lengths that lies, m."""
         views, layout = self.sheet.views, Layout.of(spline, COARSE_STEP * self.step)
         within = (layout.s >= reference[0]) & (layout.s <= reference[1])
         for _ in range(coarse):
-            strips = cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + WIDE_PX, rough=True)
-            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within, near=near).spline
+            strips = cut(self.sheet, layout.basis @ spline.control, layout.slope @ spline.control, self.reach + WIDE_PX,
+                         rough=True)
+            spline = solve(layout, spline, strips, search(strips, self.template, smooth=3), views, within,
+                           near=near).spline
         if coarse:
             return spline, reference
         strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
         measured = measure(strips, self.cylinder, within)
-        stretch = supported(measured.presence.T, self.clutter(spline, reference)[:, None] / measured.usual, COARSE_STEP, self.gap_px)
+        stretch = supported(measured.presence.T, self.clutter(spline, reference)[:, None] / measured.usual, COARSE_STEP,
+                            self.gap_px)
         if stretch is not None:
             reference = (layout.s[stretch[0]], layout.s[stretch[1]])
         return solve(layout, spline, strips, measured, views, within).spline, reference
@@ -192,13 +224,15 @@ class _Pair:
         return max(GAP / self.step, BRIDGED_PX)
 
     def clutter(self, spline: Spline3, reference: tuple[float, float]) -> np.ndarray:
-        """(2,) how dark places beside the curve between two arc lengths (m) happen to look in each plane, see strips.clutter."""
-        strips = cut(self.sheet, *spline.lines(np.arange(*reference, COARSE_STEP * self.step)), 2 * self.reach + WIDE_PX, rough=True)
+        """(2,) how dark places beside the curve between two arc lengths (m) happen to look in each plane, see
+        strips.clutter."""
+        strips = cut(self.sheet, *spline.lines(np.arange(*reference, COARSE_STEP * self.step)),
+                     2 * self.reach + WIDE_PX, rough=True)
         return clutter(strips, self.narrow, self.reach, SMOOTH_PX // COARSE_STEP)
 
     def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray, np.ndarray]:
-        """The curve prolonged as long as that finds more of the device, straight on or beside it; (2, 2) what then is aside, see `aside`, and (2,) what
-        says that it goes on still, see `farther`."""
+        """The curve prolonged as long as that finds more of the device, straight on or beside it; (2, 2) what then is
+        aside, see `aside`, and (2,) what says that it goes on still, see `farther`."""
         coarse = int(self.cleared is None)     # a search would find the line beside the device again
         for _ in range(GROWTH):
             beyond, aside = seen.beyond, None
@@ -212,7 +246,8 @@ class _Pair:
                     return seen, aside, nats
             by = max(GROWTH_PX, farther[nats > GOES_ON_BOTH].max(initial=0) + NEAR_END_PX) * self.step
             (start, stop), (spline, shift) = seen.reference, prolong(seen.solution.spline, goes_on, by)
-            longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), coarse, FINE - 1, near=True)
+            longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), coarse,
+                                 FINE - 1, near=True)
             more = longer is not None and np.diff(longer.reference) - (stop - start) > NEAR_END_PX * self.step
             if not more and aside is not None:
                 return seen, aside, nats        # that line is another one
@@ -222,7 +257,8 @@ class _Pair:
         return seen, self.aside(seen), self.farther(seen)[1]
 
     def farther(self, seen: _Seen) -> tuple[np.ndarray, np.ndarray]:
-        """(2,) px by which the device may go on past the first and the last end, straight on, perhaps beyond a gap; and (2,) nats that speak for that."""
+        """(2,) px by which the device may go on past the first and the last end, straight on, perhaps beyond a gap; and
+        (2,) nats that speak for that."""
         px = np.arange(1, min(round(GAP / self.step), LOOK_PX), COARSE_STEP)
         s = np.array(seen.reference)[:, None] + OUTWARD[:, None] * (px + SMOOTH_PX) * self.step
         strips = cut(self.sheet, *seen.solution.spline.lines(s.ravel()), self.reach + WIDE_PX, rough=True)
@@ -230,14 +266,17 @@ class _Pair:
         for k in (0, 1):
             mine = slice(k * len(px), (k + 1) * len(px))
             straight = np.abs(strips.offsets_px) <= 1 + px[:, None] * ASTRAY     # it need not go on quite straight
-            dark = [np.where(straight, darkness_across(p[mine], t) / ((t - t.mean()) @ (t - t.mean())), -np.inf).max(axis=1) for p, t in zip(strips.profiles, self.narrow)]
-            total = np.cumsum(evidence(np.where(strips.inside[:, mine], dark, np.nan) / usual, seen.clutter[:, None] / usual, COARSE_STEP))
+            dark = [np.where(straight, darkness_across(p[mine], t) / ((t - t.mean()) @ (t - t.mean())),
+                             -np.inf).max(axis=1) for p, t in zip(strips.profiles, self.narrow)]
+            total = np.cumsum(evidence(np.where(strips.inside[:, mine], dark, np.nan) / usual,
+                                       seen.clutter[:, None] / usual, COARSE_STEP))
             best = int(total.argmax())
             far[k], nats[k] = px[best], max(float(total[best]), 0.0)
         return far, nats
 
     def aside(self, seen: _Seen) -> np.ndarray:
-        """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on, in plane A, B."""
+        """(2, 2) darkness, as a share of the device's, of a line within WIDE_PX of where each end (rows) would go on,
+        in plane A, B."""
         px = np.arange(-80, 20)
         s = (np.array(seen.reference)[:, None] + OUTWARD[:, None] * px * self.step).ravel()
         strips = cut(self.sheet, *seen.solution.spline.lines(s), self.reach + WIDE_PX, rough=True).halves()
@@ -251,7 +290,8 @@ class _Pair:
         return without_neighbours(cut(self.sheet, points, tangents, self.reach + WIDE_PX), self.cleared, self.reach)
 
     def look(self, model: Model, f: Fit, s: np.ndarray, within: np.ndarray) -> tuple[Strips, Measurement]:
-        """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by the ends: see Strips.halves."""
+        """Strips across a fit at (N,) arc lengths, and what they say of a device of this `model`; or at (2, N / 2), by
+        the ends: see Strips.halves."""
         strips = self.cut(*f.spline.lines(s.ravel()))
         if s.ndim == 2:
             strips, model, within = strips.halves(), model.twice(), np.concatenate([within, within])
@@ -259,7 +299,8 @@ class _Pair:
 
 
 def _agree(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> list[EndRow]:
-    """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough to say where it ends."""
+    """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough
+    to say where it ends."""
     rows = []
     for end, by in zip(ends, _shown_by_one(f)):
         if end is not None and by < 0 and np.isfinite(end.seen_at).all():
@@ -272,7 +313,8 @@ def _agree(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> list[En
 
 @lru_cache(64)
 def _looks(*half_width_cpx: int) -> tuple[float, np.ndarray, np.ndarray, Model, list[np.ndarray]]:
-    """How far strips reach, the shadow of a cylinder of so many hundredths of a px in each plane, and what a _Pair makes of it."""
+    """How far strips reach, the shadow of a cylinder of so many hundredths of a px in each plane, and what a _Pair
+    makes of it."""
     reach = half_width_range(max(half_width_cpx) / 100)
     offsets = np.arange(-reach, reach + 1)
     template = np.stack([shadow(h / 100, offsets) for h in half_width_cpx])
@@ -281,14 +323,16 @@ def _looks(*half_width_cpx: int) -> tuple[float, np.ndarray, np.ndarray, Model, 
 
 
 def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
-    """(2,) darkness that each plane shows just past strip `at`, as a share of the device's; NaN outside its field, 1 where the strips end before it does."""
+    """(2,) darkness that each plane shows just past strip `at`, as a share of the device's; NaN outside its field, 1
+    where the strips end before it does."""
     past = presence[at + 5:at + 22] if outward > 0 else presence[max(at - 21, 0):max(at - 4, 0)]
     if len(past) < 10:
         return np.where(np.isnan(past).any(axis=0), np.nan, 1.0)
     return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
-def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: list[float], radius: float) -> tuple[Fit, list[End | None]]:
+def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: list[float],
+            radius: float) -> tuple[Fit, list[End | None]]:
     """The fit, and its ends where they are seen."""
     s, strips, seen, reference, solution = found.layout.s, found.strips, found.measured, found.reference, found.solution
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
@@ -298,11 +342,13 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
     scale = np.array(half_width) / radius
     across = straight_on(contrast, middle(strips.speed[:, between]) / scale)
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
-    open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])     # it runs out of a field before its end
+    # it runs out of a field before its end
+    open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
     height, inner = _levels(twice(seen.presence), OUTWARD[:, None] * (np.array(reference)[:, None] - s), s[1] - s[0])
     noise = _noise(seen, found.clutter)
-    located = locate(twice(s), twice(seen.presence) / height[..., None], twice(noise) / height, twice(strips.speed), np.array(reference), OUTWARD,
+    located = locate(twice(s), twice(seen.presence) / height[..., None], twice(noise) / height, twice(strips.speed),
+                     np.array(reference), OUTWARD,
                      *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
     start_stop, ends = [end.at for end in located], list[End | None](located)
     for k in np.nonzero(open_end)[0]:
@@ -310,60 +356,73 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
         start_stop[k] = s[min(max(at[k] + OUTWARD[k] * (dark[0] - 1 if len(dark) else 0), 0), len(s) - 1)]
         ends[k] = None
     start, stop = start_stop
-    return Fit(solution.spline, start, stop, np.zeros(2), open_end, solution.covariance(), s, presence, solution.offset_px.T,
+    return Fit(solution.spline, start, stop, np.zeros(2), open_end, solution.covariance(), s, presence,
+               solution.offset_px.T,
                across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
-               np.nan_to_num(found.clutter / middle(seen.usual), nan=1.0), np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
+               np.nan_to_num(found.clutter / middle(seen.usual), nan=1.0), np.where(open_end, 0.0, farther),
+               np.full(2, -1), solution.moved_px), ends
 
 
 def _noise(seen: Measurement, clutter: np.ndarray) -> np.ndarray:
-    """(2,) standard deviation of presence in each plane, as it is averaged along the curve: that of what lies beside the device, where that is more than noise."""
+    """(2,) standard deviation of presence in each plane, as it is averaged along the curve: that of what lies beside
+    the device, where that is more than noise."""
     return np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual), nan=1e-9))
 
 
 def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2, 2) and (2,) of ends.level for both ends (rows): of (2, 2, N) presence, at (2, N) arc lengths inside them, m."""
+    """(2, 2) and (2,) of ends.level for both ends (rows): of (2, 2, N) presence, at (2, N) arc lengths inside them,
+    m."""
     height, inner = zip(*(level(p, i, px) for p, i in zip(presence, inward)))
     return np.array(height), np.array(inner)
 
 
-def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray,
+                  radius: float) -> tuple[np.ndarray, np.ndarray]:
     """(2, 2) m of `bulge` at each end (rows) in each plane, and (2, 2) m over which each end fades there."""
     sine = np.clip(speed / px_per_m, 0.1, 1.0)
     return bulge(radius, speed, px_per_m, across), radius * np.sqrt(1 - sine**2) / sine
 
 
-def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[float], radius: float, clutter: np.ndarray) -> Fit:
-    """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not count."""
+def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[float], radius: float,
+              clutter: np.ndarray) -> Fit:
+    """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not
+    count."""
     scale, step, by = np.array(half_width) / radius, f.s[1] - f.s[0], _shown_by_one(f)
-    alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1 for end, v in zip(ends, by)])
+    alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1
+                      for end, v in zip(ends, by)])
     at = np.array([x if end is None or v < 0 else end.seen_at[v] for end, v, x in zip(ends, alone, (f.start, f.stop))])
     window = np.arange(-END_WINDOW_PX, END_WINDOW_PX + END_STEP_PX, END_STEP_PX) * step
     s = at[:, None] + window
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
-    presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))      # (ends, planes, strips)
+    # (ends, planes, strips)
+    presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))
     there = speed[:, :, len(window) // 2]
     height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
     shape = _shape_of_end(there, scale, f.across, radius)
     noise = np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9)      # (planes,)
-    again = locate(s, presence / height[..., None], np.maximum(seen.presence_sigma.reshape(2, 2).T, noise) / height, speed, at, OUTWARD, *shape,
-                   density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
+    again = locate(s, presence / height[..., None], np.maximum(seen.presence_sigma.reshape(2, 2).T, noise) / height,
+                   speed, at, OUTWARD, *shape, density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
     hard, sigma = crowded(f), np.zeros(2)
     for k, (end, v) in enumerate(zip(ends, alone)):
         if v >= 0 and np.isfinite(again[k].seen_at[v]):
             at[k], sigma[k], hard[k] = again[k].seen_at[v], again[k].seen_sigma[v], True
         elif end is not None:
-            at[k], sigma[k] = again[k].at, replace(end, sigma=end.sigma if end.sigma > END_REACH_PX * step else again[k].sigma).honest_sigma
+            at[k], sigma[k] = again[k].at, replace(end, sigma=end.sigma if end.sigma > END_REACH_PX * step
+                                                              else again[k].sigma).honest_sigma
         if end is not None and inner[k] < np.inf:
-            further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]), clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9), step)
+            further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]),
+                                        clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
-    told = [(end.seen_at, end.seen_sigma) if end is not None and v < 0 and not h else np.full((2, 2), np.nan) for end, v, h in zip(ends, by, hard)]
+    told = [(end.seen_at, end.seen_sigma) if end is not None and v < 0 and not h else np.full((2, 2), np.nan)
+            for end, v, h in zip(ends, by, hard)]
     return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone,
                    seen_at=np.stack([place for place, _ in told]), seen_sigma=np.stack([unsure for _, unsure in told]))
 
 
 def _shown_by_one(f: Fit) -> np.ndarray:
-    """(2,) the plane that shows the first and the last end well where a line that crosses the device may hide it in the other; -1 where there is none."""
+    """(2,) the plane that shows the first and the last end well where a line that crosses the device may hide it in the
+    other; -1 where there is none."""
     dark = np.maximum(f.beyond, f.aside)
     hidden = (dark.min(axis=1) < BARE) & (dark.max(axis=1) > HIDES) & (f.beyond.max(axis=1) < CROSSES) & ~f.open_end
     return np.where(hidden, dark.argmin(axis=1), -1)

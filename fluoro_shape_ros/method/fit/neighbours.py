@@ -1,4 +1,5 @@
-"""Strips without the line beside the device: a lead or a wire that runs along it for a while pulls a fit aside and spoils the device's profile."""
+"""Strips without the line beside the device: a lead or a wire that runs along it for a while pulls a fit aside and
+spoils the device's profile."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from ...geometry.curve import middle
 from ...imaging.profiles import shadow
 from ...imaging.strips import Strips, darkness_across
 
-APART_PX = 2.5          # beyond the device's half width, from its middle to that of the nearest line that can be told from it
+APART_PX = 2.5          # beyond the device's half width, from its middle to that of the nearest line that can be told
+                        # from it
 ALONG = 9               # strips over which a line is looked for
 FAINT = 0.4             # of the device's darkness: a fainter line does no harm
 NARROW, WIDE = 0.7, 1.6     # times as wide as the device: what such lines are made of
@@ -20,10 +22,11 @@ STIFF = 1e-6            # keeps the equations solvable where both look alike
 
 
 def without_neighbours(strips: Strips, half_width_px: Sequence[float], keep_px: float) -> Strips:
-    """`strips` cut wide, without the darkest line beside the device in each, and only as far as `keep_px` to either side.
+    """`strips` cut wide, without the darkest line beside the device in each, and only as far as `keep_px` to either
+    side.
 
-    half_width_px: (V,) of the device. Least squares of each strip for a parabola, the device at its place (profile and shift) and the other line where it
-    looks darkest (two widths and a shift); what is the other line's is taken away.
+    half_width_px: (V,) of the device. Least squares of each strip for a parabola, the device at its place (profile and
+    shift) and the other line where it looks darkest (two widths and a shift); what is the other line's is taken away.
     """
     x = strips.offsets_px
     kept = np.abs(x) <= keep_px
@@ -42,7 +45,8 @@ def _cleared(profiles: np.ndarray, half_width: float, x: np.ndarray) -> np.ndarr
     slope = lambda h, y: 0.5 * (shadow(h, y + 1) - shadow(h, y - 1))        # noqa: E731
     moved, u = x - x[beside[there].argmax(axis=1), None], x / x[-1]         # (n, W) from the other line
     own = np.stack([np.ones_like(u), u, u * u, shadow(half_width, x), slope(half_width, x)], axis=-1)
-    other = np.stack([shadow(half_width * NARROW, moved), shadow(half_width * WIDE, moved), slope(half_width, moved)], axis=-1)
+    other = np.stack([shadow(half_width * NARROW, moved), shadow(half_width * WIDE, moved), slope(half_width, moved)],
+                     axis=-1)
     A = np.concatenate([np.broadcast_to(own, (len(there), *own.shape)), other], axis=-1)
     T = A.transpose(0, 2, 1)
     amounts = np.linalg.solve(T @ A + STIFF * np.eye(A.shape[-1]), T @ profiles[there][..., None])

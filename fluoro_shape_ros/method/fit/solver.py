@@ -1,4 +1,5 @@
-"""One step of the two-image fit: the normal equations of a spline's control points, and what they know of its errors."""
+"""One step of the two-image fit: the normal equations of a spline's control points, and what they know of its
+errors."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from ...geometry.curve import middle
 from ...geometry.spline import Spline3, bending
 from ...imaging.strips import Measurement, Strips
 
-BEND_SIGMA = 3e-3 / 0.01**3     # 1/m^2: typical change of curvature along a device (third differences of 3 mm at control points 10 mm apart)
+# 1/m^2: typical change of curvature along a device (third differences of 3 mm at control points 10 mm apart)
+BEND_SIGMA = 3e-3 / 0.01**3
 SLIDE = 1e-4            # m: images do not see a curve slide along itself, so no step may
 MODEL_PX = 0.15         # what the model of a strip is worth (0.03 px, the same over some 25 strips), added to the noise
 BLOCK = 16              # strips over which errors that go together (anatomy, crossings) show
@@ -28,8 +30,8 @@ FLOOR = 1.0             # 1/m^2: no unknown is known less well than to a metre, 
 class Layout:
     """Strips at even steps along a spline, and which unknowns each touches: what all rounds of a fit share.
 
-    The Jacobian is tall and mostly zero: its rows are sorted by the piece of the spline whose BAND unknowns each sees, as (n - 3, M) padded tables, and
-    the normal equations are banded.
+    The Jacobian is tall and mostly zero: its rows are sorted by the piece of the spline whose BAND unknowns each sees,
+    as (n - 3, M) padded tables, and the normal equations are banded.
     """
 
     s: np.ndarray           # (N,) m
@@ -39,7 +41,8 @@ class Layout:
     at: np.ndarray          # (n - 3, M) strip at each place of the table
     there: np.ndarray       # (n - 3, M) bool: whether there is one
     unknowns: np.ndarray    # (n - 3, BAND) index of those that a piece touches
-    band: np.ndarray        # (n - 3, BAND, BAND) where each term of a piece's equations stands in the lower band; past its end for those above the diagonal
+    band: np.ndarray        # (n - 3, BAND, BAND) where each term of a piece's equations stands in the lower band; past
+                            # its end for those above the diagonal
     stiffness: np.ndarray   # (n, n) 1/m^2: a device bends evenly (third differences of the control points)
     prior: np.ndarray       # (BAND, 3 n) 1/m^2, lower band: that, and no step slides it along itself
 
@@ -57,7 +60,8 @@ class Layout:
         at, unknowns = np.where(there, starts[:, None] + place, 0), first[:, 0] + local
         D = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
         stiffness, (basis, slope) = D.T @ D, spline.bases(s, 0, 1)
-        along = (b[:, :, None] * (slope @ spline.control)[:, None, :]).reshape(-1, BAND)[at[:, ::4]] * (there[:, ::4, None] / SLIDE)
+        along = ((b[:, :, None] * (slope @ spline.control)[:, None, :]).reshape(-1, BAND)[at[:, ::4]]
+                 * (there[:, ::4, None] / SLIDE))
         prior = _sum(band, along.transpose(0, 2, 1) @ along, 3 * n)
         prior[0] += FLOOR
         for j in range(4):
@@ -82,7 +86,8 @@ class Solution:
     """A spline after one step of the solver."""
 
     spline: Spline3
-    information: Callable[[], np.ndarray]   # (BAND, 3 n) 1/m^2 of the control points, its lower band; worth computing of the last step only
+    information: Callable[[], np.ndarray]   # (BAND, 3 n) 1/m^2 of the control points, its lower band; worth computing
+                                            # of the last step only
     offset_px: np.ndarray       # (2, N) of the device from the curve, after the step; NaN where not measured
     moved_px: float             # how far the step went, at most
 
@@ -105,11 +110,13 @@ class EndRow:
         return np.stack([np.append(np.diagonal(full, k), np.zeros(k)) for k in range(BAND)])
 
     @classmethod
-    def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray, views: Sequence[View]) -> EndRow:
+    def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray,
+           views: Sequence[View]) -> EndRow:
         """From where along the curve, m, each plane (2,) sees the device end.
 
-        A curve that runs in an epipolar plane is seen across itself by neither plane; only its ends tell its depth. Moved by dX at its end, plane v
-        sees that end at s_v - t_v J_v dX / |J_v X'|, t_v along the projected curve; both planes must see one end:
+        A curve that runs in an epipolar plane is seen across itself by neither plane; only its ends tell its depth.
+        Moved by dX at its end, plane v sees that end at s_v - t_v J_v dX / |J_v X'|, t_v along the projected curve;
+        both planes must see one end:
         (t_a J_a / |J_a X'| - t_b J_b / |J_b X'|) dX = s_a - s_b.
         """
         s = np.array([at])
@@ -124,19 +131,23 @@ class EndRow:
         return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
 
 
-def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views: Sequence[View], within: np.ndarray, ends: Sequence[EndRow] = (),
-          near: bool = True) -> Solution:
-    """One Gauss-Newton step. `ends`: what else must hold. near: the curve lies on the device already, so that what is far off is not it.
+def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views: Sequence[View], within: np.ndarray,
+          ends: Sequence[EndRow] = (), near: bool = True) -> Solution:
+    """One Gauss-Newton step. `ends`: what else must hold. near: the curve lies on the device already, so that what is
+    far off is not it.
 
-    Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's biweight); prior: third
-    differences of the control points. The Jacobian of a projection has rank 2, n picks what is seen across the curve.
+    Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's
+    biweight); prior: third differences of the control points. The Jacobian of a projection has rank 2, n picks what is
+    seen across the curve.
     """
     n, at = len(spline.control), layout.at
     P = np.stack([v.P for v in views])
     depth = layout.basis @ (spline.control @ P[:, 2, :3].T) + P[:, 2, 3]                                        # (N, 2)
     along = np.einsum('vnk,vnk->vn', strips.normals, strips.centers_px)
-    across = (strips.normals @ P[:, :2, :3] - along[..., None] * P[:, 2:, :3]) / depth.T[..., None]             # (2, N, 3) n . J
-    rows = (layout.weights[:, :, None] * across[:, :, None, :]).reshape(2, -1, BAND)[:, at]                     # (2, n - 3, M, BAND)
+    # (2, N, 3) n . J
+    across = (strips.normals @ P[:, :2, :3] - along[..., None] * P[:, 2:, :3]) / depth.T[..., None]
+    # (2, n - 3, M, BAND)
+    rows = (layout.weights[:, :, None] * across[:, :, None, :]).reshape(2, -1, BAND)[:, at]
     rows = rows.transpose(1, 0, 2, 3).reshape(n - 3, -1, BAND)
     columns = rows.transpose(0, 2, 1)
     tabled = lambda x: x[:, at].transpose(1, 0, 2).reshape(n - 3, -1)     # noqa: E731
@@ -170,7 +181,8 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
 
 
 def _together(z: np.ndarray) -> float:
-    """By how much the mean of BLOCK successive normalised residuals varies more than independent ones would; at least 1."""
+    """By how much the mean of BLOCK successive normalised residuals varies more than independent ones would;
+    at least 1."""
     if len(z) < 4 * BLOCK:
         return 1.0
     total = z[:len(z) // BLOCK * BLOCK].reshape(-1, BLOCK) @ np.ones(BLOCK)

@@ -1,8 +1,9 @@
 """Which candidate of plane A and which of plane B are the same device, and which of their points correspond.
 
-A local alignment (Smith and Waterman 1981) of the two curves' points: going along both at once, each point that lies on the
-other's epipolar line gains its length, each that does not costs. It is monotone, skips what only one plane sees, leaves the ends free, and
-needs no unique intersection, so tangency to an epipolar line and self-crossings do not break it.
+A local alignment (Smith and Waterman 1981) of the two curves' points: going along both at once, each point that lies on
+the other's epipolar line gains its length, each that does not costs. It is monotone, skips what only one plane sees,
+leaves the ends free, and needs no unique intersection, so tangency to an epipolar line and self-crossings do not break
+it.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ class Alignment:
     along_b: np.ndarray     # (K,) px; from the last point when flipped
 
 
-def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[np.ndarray], F: np.ndarray, best: int = 4) -> list[Alignment]:
-    """The `best` alignments among all pairs of (N, 2) undistorted curves, best first; F maps A to B. `weights`: how much each
-    curve of A and of B counts. Empty where nothing fits."""
+def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[np.ndarray], F: np.ndarray,
+          best: int = 4) -> list[Alignment]:
+    """The `best` alignments among all pairs of (N, 2) undistorted curves, best first; F maps A to B. `weights`: how
+    much each curve of A and of B counts. Empty where nothing fits."""
     if not curves_a or not curves_b:
         return []
     a, length_a = _sampled(curves_a)
@@ -48,14 +50,16 @@ def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[
         d = np.minimum(_distance_across(to_b, 2), _distance_across(to_a, 1))
         gains.append(np.maximum(1 - (d / TOLERANCE_PX) ** 2, WORST).astype(np.float32))
     gain = np.stack(gains)                                                      # (na, nb, S, S)
-    gain = np.stack([gain, gain[..., ::-1]], axis=2)                            # and B read backwards: (na, nb, 2, S, S)
+    # and B read backwards: (na, nb, 2, S, S)
+    gain = np.stack([gain, gain[..., ::-1]], axis=2)
     step_a = (length_a / (SAMPLES - 1))[:, None, None, None].astype(np.float32)
     step_b = (length_b / (SAMPLES - 1))[None, :, None, None].astype(np.float32)
     total = _fill(gain, step_a, step_b)
     flat = total.reshape(len(a), len(b), 2, -1)
     matched = flat.max(axis=3)
     share = matched / (length_a[:, None, None] + length_b[None, :, None])
-    score = np.sqrt(matched) * share**2 * weights[0][:, None, None] * weights[1][None, :, None]    # a device is seen whole by both
+    # a device is seen whole by both
+    score = np.sqrt(matched) * share**2 * weights[0][:, None, None] * weights[1][None, :, None]
     found = []
     for k in np.argsort(-score, axis=None)[:best]:
         ia, ib, flip = np.unravel_index(k, score.shape)
@@ -64,7 +68,8 @@ def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[
         i, j = _trace(total[ia, ib, flip], gain[ia, ib, flip], float(length_a[ia]), float(length_b[ib]))
         if min(np.ptp(i), np.ptp(j)) < 5:       # a point of one plane against a line of the other is no curve
             continue
-        found.append(Alignment(int(ia), int(ib), bool(flip), float(score[ia, ib, flip]), i * length_a[ia] / (SAMPLES - 1), j * length_b[ib] / (SAMPLES - 1)))
+        found.append(Alignment(int(ia), int(ib), bool(flip), float(score[ia, ib, flip]),
+                               i * length_a[ia] / (SAMPLES - 1), j * length_b[ib] / (SAMPLES - 1)))
     return found
 
 
@@ -86,7 +91,8 @@ def _distance_across(signed: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _fill(gain: np.ndarray, step_a: np.ndarray, step_b: np.ndarray) -> np.ndarray:
-    """(..., S, S) best score of an alignment that ends at each pair of samples; rows one after another, all pairs of curves at once."""
+    """(..., S, S) best score of an alignment that ends at each pair of samples; rows one after another, all pairs of
+    curves at once."""
     total = np.zeros_like(gain)
     before = np.zeros(gain.shape[:-2] + (gain.shape[-1],), gain.dtype)
     for i in range(gain.shape[-2]):

@@ -17,7 +17,8 @@ ALONG = 0.3             # correspondences along the curve count this much of wha
 
 
 def first_curve(views: Sequence[View], a_px: np.ndarray, b_px: np.ndarray, alignment: Alignment) -> np.ndarray:
-    """(M, 3) points in m along the device, from its two undistorted centrelines (N, 2) and (K, 2) and how they correspond.
+    """(M, 3) points in m along the device, from its two undistorted centrelines (N, 2) and (K, 2) and how they
+    correspond.
 
     Each image point u gives the equations (P_1 - u P_3) X = 0 (HZ 12.2), turned across and along the centreline.
     """
@@ -42,7 +43,8 @@ def first_curve(views: Sequence[View], a_px: np.ndarray, b_px: np.ndarray, align
         tangent /= np.linalg.norm(tangent, axis=1, keepdims=True) + 1e-9
         B = BSpline(knots, np.eye(n), 3)(t)
         for direction, weight in ((np.c_[-tangent[:, 1], tangent[:, 0]], 1.0), (tangent, ALONG)):
-            E = (np.einsum('ik,kj->ij', direction, view.P[:2]) - np.einsum('ik,ik->i', direction, u)[:, None] * view.P[2]) * (weight / d)
+            E = (np.einsum('ik,kj->ij', direction, view.P[:2])
+                 - np.einsum('ik,ik->i', direction, u)[:, None] * view.P[2]) * (weight / d)
             rows.append((B[:, :, None] * E[:, None, :3]).reshape(len(u), 3 * n))
             right.append(-E[:, 3])
     A, y = np.concatenate(rows), np.concatenate(right)

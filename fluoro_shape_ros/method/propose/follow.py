@@ -1,7 +1,9 @@
-"""From a predicted curve to the device near it: in strips across its projections, the darkest smooth path, and one step of the fit's solver to both.
+"""From a predicted curve to the device near it: in strips across its projections, the darkest smooth path, and one step
+of the fit's solver to both.
 
-The path in each plane is the most probable one (Viterbi 1967) where the response of each strip speaks for a shift and the prediction's standard
-deviation against it. Shifts in the two planes are the two directions across the curve, so each plane can be asked alone.
+The path in each plane is the most probable one (Viterbi 1967) where the response of each strip speaks for a shift and
+the prediction's standard deviation against it. Shifts in the two planes are the two directions across the curve, so
+each plane can be asked alone.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ def reach_px(guess: Guess, view: View) -> float:
 
 
 def follow(sheet: Sheet, guess: Guess, radius: float, clear: bool = True) -> np.ndarray | None:
-    """(M, 3) points in m along what looks most like the device of `radius` m near `guess`, base to tip; None where nothing does.
+    """(M, 3) points in m along what looks most like the device of `radius` m near `guess`, base to tip; None where
+    nothing does.
 
     clear: only where it is seen nearly all the way.
     """
@@ -47,7 +50,8 @@ def follow(sheet: Sheet, guess: Guess, radius: float, clear: bool = True) -> np.
     scale = np.array([pixels_per_metre(v.P, guess.points) for v in views])
     spline = through(guess.points, BEYOND_PX / scale.max())
     layout = Layout.of(spline, STEP_PX / scale.max())
-    sigma_px = np.interp(layout.s, np.linspace(0, arc_length(guess.points)[-1], len(guess.sigma)), guess.sigma) * scale[:, None]     # (2, N)
+    sigma_px = (np.interp(layout.s, np.linspace(0, arc_length(guess.points)[-1], len(guess.sigma)), guess.sigma)
+                * scale[:, None])     # (2, N)
     reach = SHIFT_PX * int(np.ceil(WITHIN * sigma_px.max() / SHIFT_PX))
     shifts = np.arange(-reach, reach + 1)
     centers, normals, speed = lay_out(views, layout.basis @ spline.control, layout.slope @ spline.control)
@@ -59,7 +63,8 @@ def follow(sheet: Sheet, guess: Guess, radius: float, clear: bool = True) -> np.
     seen = np.zeros(gain.shape, bool)
     for g, s, c, v in zip(gain, seen, centers, views):
         start, stop = _darkest_stretch(g)
-        if stop - start < 2 or clear and (stop - start < SHORTEST * in_image(v, c).sum() or (g[start:stop] > 0).mean() < SEEN):
+        if stop - start < 2 or clear and (stop - start < SHORTEST * in_image(v, c).sum()
+                                          or (g[start:stop] > 0).mean() < SEEN):
             return None
         s[start:stop] = True
     both = np.nonzero(seen.all(axis=0))[0]
@@ -73,11 +78,13 @@ def follow(sheet: Sheet, guess: Guess, radius: float, clear: bool = True) -> np.
 
 
 def _response(sheet: Sheet, at: tuple[np.ndarray, np.ndarray], half_width_px: np.ndarray) -> np.ndarray:
-    """(V, N, W) how much darker than beside it each place at (V, N, W) columns and rows is, over the device's width, in noise deviations; 0 outside the field."""
+    """(V, N, W) how much darker than beside it each place at (V, N, W) columns and rows is, over the device's width, in
+    noise deviations; 0 outside the field."""
     profiles, lit = sheet.sample(*at, cv2.INTER_LINEAR), sheet.exposed(*at)
     half = int(np.ceil(1.6 * half_width_px.max() + 3))
     templates = [shadow(h, np.arange(-half, half + 1)) for h in half_width_px]
-    response = np.stack([cv2.filter2D(p, cv2.CV_32F, (t.mean() - t)[None].astype(np.float32), borderType=cv2.BORDER_REPLICATE) for p, t in zip(profiles, templates)])
+    response = np.stack([cv2.filter2D(p, cv2.CV_32F, (t.mean() - t)[None].astype(np.float32),
+                                      borderType=cv2.BORDER_REPLICATE) for p, t in zip(profiles, templates)])
     if not lit.all():
         flat = lit.astype(np.uint8).reshape(-1, lit.shape[2])
         lit = cv2.erode(flat, np.ones((1, 2 * half + 1), np.uint8), borderValue=255).reshape(lit.shape) > 0

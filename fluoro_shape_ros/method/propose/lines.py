@@ -1,4 +1,5 @@
-"""Hypotheses from lines: what one image shows as a line of the device's width, and which line of plane A may be which of plane B."""
+"""Hypotheses from lines: what one image shows as a line of the device's width, and which line of plane A may be which
+of plane B."""
 
 from __future__ import annotations
 
@@ -22,13 +23,15 @@ from .first_curve import first_curve
 LINES = 40              # strongest lines of an image that are looked at closely ...
 CANDIDATES = 20         # ... and most device-like ones among them that are compared between the planes
 ALIGNMENTS = 30         # of a line of each plane that are proposed
-FLIPPED = 0.7           # score of a pair of lines read the other way round, as a share of the better way's, that must be tried, too
-UNLIKE, ODD = 0.3, 0.6  # difference to a cylinder's profile (correlation), and to its width (logarithm), that make a line less likely the device's
+FLIPPED = 0.7           # score of a pair of lines read the other way round, as a share of the better way's, that must
+                        # be tried, too
+UNLIKE, ODD = 0.3, 0.6  # difference to a cylinder's profile (correlation), and to its width (logarithm), that make a
+                        # line less likely the device's
 FAINT_LENGTH_PX = 7.0   # sigma along which faint lines are averaged, in px of the smaller image
 FAINT_SCALE = 0.7       # of the half width there, that is the filter's scale; at least FINEST px
 FINEST = 0.9
 
-Lines = tuple[Candidate | None, Candidate | None]       # of planes a and b; None where the line there is not the device's
+Lines = tuple[Candidate | None, Candidate | None]   # of planes a and b; None where the line there is not the device's
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,27 +44,34 @@ class Hypothesis:
     clearing: bool = False      # whether lines beside it are taken away
 
 
-def candidates(sheet: Sheet, radius: float, min_length_px: float, faint: bool) -> tuple[list[Candidate], list[Candidate]]:
-    """The most device-like lines of each plane, best first; `faint` ones are averaged along themselves, which takes longer."""
+def candidates(sheet: Sheet, radius: float, min_length_px: float,
+               faint: bool) -> tuple[list[Candidate], list[Candidate]]:
+    """The most device-like lines of each plane, best first; `faint` ones are averaged along themselves, which takes
+    longer."""
     center = isocenter(sheet.views)[None]
     widths = [radius * pixels_per_metre(v.P, center) for v in sheet.views]
-    return both(lambda image, field, width: _candidates(image, field, width, min_length_px, faint), sheet.planes, sheet.fields, widths, pixels=sum(p.size for p in sheet.planes))
+    return both(lambda image, field, width: _candidates(image, field, width, min_length_px, faint), sheet.planes,
+                sheet.fields, widths, pixels=sum(p.size for p in sheet.planes))
 
 
 def by_lines(views: Sequence[View], found: tuple[list[Candidate], list[Candidate]]) -> Iterator[Hypothesis]:
-    """One for a line of each plane that may be the same device, most likely first; the other direction only where that fits about as well."""
+    """One for a line of each plane that may be the same device, most likely first; the other direction only where that
+    fits about as well."""
     if not all(found):
         return
     curves = [[undistort(v, c.points_px) for c in lines] for v, lines in zip(views, found)]
     scores: dict[tuple[int, int], float] = {}
-    for alignment in align(curves[0], curves[1], [np.array([c.score for c in lines]) for lines in found], fundamental(views[0].P, views[1].P), best=ALIGNMENTS):
+    for alignment in align(curves[0], curves[1], [np.array([c.score for c in lines]) for lines in found],
+                           fundamental(views[0].P, views[1].P), best=ALIGNMENTS):
         a, b = alignment.a, alignment.b
         if alignment.score >= FLIPPED * scores.setdefault((a, b), alignment.score):
             yield Hypothesis(first_curve(views, curves[0][a], curves[1][b], alignment), (found[0][a], found[1][b]))
 
 
-def _candidates(image: np.ndarray, field: np.ndarray, half_width_px: float, min_length_px: float, faint: bool) -> list[Candidate]:
-    ridges = _faint_ridges(image, field, half_width_px) if faint else find_ridges(image, field, ridge_scale(half_width_px), shrinking(half_width_px))
+def _candidates(image: np.ndarray, field: np.ndarray, half_width_px: float, min_length_px: float,
+                faint: bool) -> list[Candidate]:
+    ridges = (_faint_ridges(image, field, half_width_px) if faint
+              else find_ridges(image, field, ridge_scale(half_width_px), shrinking(half_width_px)))
     lines = find_candidates(ridges, min_length_px, count=LINES)
     if not lines:
         return []
@@ -69,13 +79,15 @@ def _candidates(image: np.ndarray, field: np.ndarray, half_width_px: float, min_
     profiles, of = pieces(strips.profiles, strips.inside, of)
     alike = likeness(profiles, half_width_px)
     seen = [apparent_width([alike[of == k]]) for k in range(len(lines))]
-    scored = [replace(line, score=_device_like(width, half_width_px, float(a.mean()))) for line, (width, a) in zip(lines, seen)]
+    scored = [replace(line, score=_device_like(width, half_width_px, float(a.mean())))
+              for line, (width, a) in zip(lines, seen)]
     scored.sort(key=lambda c: -c.score * np.sqrt(len(c.z)))
     return scored[:CANDIDATES]
 
 
 def _device_like(width: float, half_width_px: float, alike: float) -> float:
-    """At most 1: how much a line of this `width` (see apparent_width) and likeness to a cylinder looks like a device; hollow and coiled ones are less alike."""
+    """At most 1: how much a line of this `width` (see apparent_width) and likeness to a cylinder looks like a device;
+    hollow and coiled ones are less alike."""
     return float(np.exp((max(alike, 0.0) - 1) / UNLIKE - 0.5 * (odd_width(width, half_width_px) / ODD)**2))
 
 

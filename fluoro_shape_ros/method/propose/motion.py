@@ -13,7 +13,8 @@ FAR = 0.008             # m: who says it has moved farther is not believed
 
 def going_on(prior: Prior, stamp_ns: int) -> np.ndarray | None:
     """(N, 3) m, base to tip, at constant velocity; None where the last two results do not tell any."""
-    if prior.previous is None or prior.before is None or prior.previous_stamp_ns is None or prior.before_stamp_ns is None:
+    if (prior.previous is None or prior.before is None or prior.previous_stamp_ns is None
+            or prior.before_stamp_ns is None):
         return None
     apart, ahead = prior.previous_stamp_ns - prior.before_stamp_ns, stamp_ns - prior.previous_stamp_ns
     if not (0 < apart <= APART_NS and 0 < ahead <= AHEAD * apart):

@@ -1,8 +1,10 @@
-"""From one plane's line to the device in space: on the rays of its points, the smooth path that the other plane shows as a device.
+"""From one plane's line to the device in space: on the rays of its points, the smooth path that the other plane shows
+as a device.
 
-Where a chain of ridges in one plane is half device and half lead, that in the other plane mostly is whole. So it alone says where the device is looked
-for in the first, not along ridges but as the most probable sequence of depths (Viterbi 1967). The state is depth and slope: at a crossing the path goes
-on as it came, and its direction in space says how dark a device is in either plane.
+Where a chain of ridges in one plane is half device and half lead, that in the other plane mostly is whole. So it alone
+says where the device is looked for in the first, not along ridges but as the most probable sequence of depths
+(Viterbi 1967). The state is depth and slope: at a crossing the path goes on as it came, and its direction in space says
+how dark a device is in either plane.
 """
 
 from __future__ import annotations
@@ -17,10 +19,13 @@ from ...data import View
 from ...geometry.cameras import depth, distort, isocenter, pixels_per_metre, plane_angle, source
 from ...imaging.ridges import ridge_scale, shrinking
 
-STEP_PX, DEPTH_PX = 3, 1        # of the image made smaller by `shrinking`: between points along the line, and between depths as the other plane shows them
+# of the image made smaller by `shrinking`: between points along the line, and between depths as the other plane shows
+# them
+STEP_PX, DEPTH_PX = 3, 1
 SLOPES = 9              # depths by which the path may move from point to point: three times as far as along the line
 BEND_COST = 0.3         # of a slope that changes by one depth a point; it never changes by more
-FAINT, DARK = 0.5, 0.9  # logarithm of the ratio to the darkness expected by which a fainter and a darker point speaks neither for nor against the path ...
+FAINT, DARK = 0.5, 0.9  # logarithm of the ratio to the darkness expected by which a fainter and a darker point speaks
+                        # neither for nor against the path ...
 FAINTER, DARKER = -1.0, 0.5     # ... and what they count at least: where it is too dark, something lies in front
 OVER = 9                # points over which a line's darkness is a median: what crosses it does not count
 STEEPEST = 0.25         # sine of the angle between axis and ray
@@ -39,10 +44,12 @@ class Path:
 
 
 def darkness(image: np.ndarray, field: np.ndarray, half_width_px: float) -> np.ndarray:
-    """(h, w) float32: how dark lines of this half width are in an (H, W) image, whatever its brightness; smaller by `shrinking`, 0 outside the field."""
+    """(h, w) float32: how dark lines of this half width are in an (H, W) image, whatever its brightness; smaller by
+    `shrinking`, 0 outside the field."""
     k = shrinking(half_width_px)
     size = image.shape[1] // k, image.shape[0] // k
-    image, field = (cv2.resize(a[:size[1] * k, :size[0] * k], size, interpolation=i) for a, i in ((image, cv2.INTER_AREA), (field, cv2.INTER_NEAREST)))
+    image, field = (cv2.resize(a[:size[1] * k, :size[0] * k], size, interpolation=i)
+                    for a, i in ((image, cv2.INTER_AREA), (field, cv2.INTER_NEAREST)))
     sigma = ridge_scale(half_width_px) / k
     smooth = cv2.GaussianBlur(cv2.log(cv2.max(image, 1e-3 * float(image.max()) + 1e-9)), (0, 0), sigma)
     uu, vv, uv = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
@@ -57,11 +64,13 @@ def _sample(dark: np.ndarray, view: View, points_px: np.ndarray) -> np.ndarray:
     k = view.width // dark.shape[1]
     at = ((distort(view, points_px.reshape(-1, 2)) - (k - 1) / 2) / k).reshape(points_px.shape).astype(np.float32)
     at = at.reshape(len(at), -1, 2)
-    return cv2.remap(dark, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0).reshape(points_px.shape[:-1])
+    return cv2.remap(dark, at[..., 0], at[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT,
+                     borderValue=0).reshape(points_px.shape[:-1])
 
 
 def sweep(line_px: np.ndarray, views: tuple[View, View], dark: tuple[np.ndarray, np.ndarray]) -> Path | None:
-    """The best path on the rays of an (N, 2) undistorted line of views[0], about a pixel apart, along what views[1] shows as dark.
+    """The best path on the rays of an (N, 2) undistorted line of views[0], about a pixel apart, along what views[1]
+    shows as dark.
 
     dark: `darkness` of both.
     """
@@ -83,7 +92,8 @@ def sweep(line_px: np.ndarray, views: tuple[View, View], dark: tuple[np.ndarray,
     seen = np.where(behind, 0, _sample(dark[1], other, x[..., :2] / np.where(behind, 1, x[..., 2])[..., None]))
     ratio = np.log(np.maximum(seen, 1e-6) / own[:, None])
     ratio = ratio[:, None] - _expected(rays, middle + step * np.arange(-SLOPES, SLOPES + 1), *sources)[..., None]
-    gain = np.maximum(1 - (ratio / np.where(ratio < 0, FAINT, DARK)) ** 2, np.where(ratio < 0, FAINTER, DARKER))    # (n, V, K)
+    # (n, V, K)
+    gain = np.maximum(1 - (ratio / np.where(ratio < 0, FAINT, DARK)) ** 2, np.where(ratio < 0, FAINTER, DARKER))
     columns, first, score = most_probable(gain.astype(np.float32))
     if len(columns) < SHORTEST:
         return None
@@ -92,23 +102,26 @@ def sweep(line_px: np.ndarray, views: tuple[View, View], dark: tuple[np.ndarray,
 
 
 def _expected(rays: np.ndarray, depths: np.ndarray, *sources: np.ndarray) -> np.ndarray:
-    """(n, V) natural logarithm of how many times as dark the second plane shows a device as the first, by the slope it comes with: the more its axis
-    points to a source, the more of it a ray there goes through.
+    """(n, V) natural logarithm of how many times as dark the second plane shows a device as the first, by the slope it
+    comes with: the more its axis points to a source, the more of it a ray there goes through.
 
-    rays: (n, 3) of the first plane. depths: (V,) m of a point where that before it has the middle one. sources: (3,) m, of both.
+    rays: (n, 3) of the first plane. depths: (V,) m of a point where that before it has the middle one. sources: (3,) m,
+    of both.
     """
     before = sources[0] + depths[len(depths) // 2] * rays[:-1]
     along = sources[0] + depths[:, None] * rays[1:, None] - before[:, None]                     # (n - 1, V, 3)
     sine = []
     for s in sources:
         across = np.linalg.norm(np.cross(along, (before - s)[:, None]), axis=2)
-        sine.append(np.maximum(across / (np.linalg.norm(along, axis=2) * np.linalg.norm(before - s, axis=1)[:, None]), STEEPEST))
+        sine.append(np.maximum(across / (np.linalg.norm(along, axis=2) * np.linalg.norm(before - s, axis=1)[:, None]),
+                               STEEPEST))
     ratio = np.log(sine[0] / sine[1])
     return np.concatenate([ratio[:1], ratio])
 
 
 def most_probable(gain: np.ndarray) -> tuple[np.ndarray, int, float]:
-    """The smooth path of the highest sum through (n, V, K) gains, which begins and ends at any row: (m,) columns, the first row, and the sum.
+    """The smooth path of the highest sum through (n, V, K) gains, which begins and ends at any row: (m,) columns, the
+    first row, and the sum.
 
     A path that moves from row to row by v columns (-V // 2 ... V // 2) takes the gains of that v.
     """
