@@ -24,7 +24,9 @@ import numpy as np
 from ..resources import resource_path
 from .features import NAMES
 
-BEYOND_DOUBT = 0.97     # confidence from which on nothing else is tried, unless min_confidence asks for more
+# confidences from which on nothing else is tried, unless min_confidence asks for more: no other line in the whole
+# images, where a better one may not have been tried yet, and none beside a curve near where the device was
+BEYOND_DOUBT, STILL_THERE = 0.99, 0.97
 PREDICTED = 1.0         # what a prediction that a curve bears out adds to its log odds
 # scales: what is worse by less says nothing, by more it says more, and in the end no more
 NEAR, FAR, LIMIT = 0.7, 2.0, 6.0

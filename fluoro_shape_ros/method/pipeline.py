@@ -74,7 +74,7 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     measured: what is made of a Fit before it is judged.
     """
     radius, polarity, least = config.radius, config.detection.polarity, config.plausibility.min_confidence
-    enough = max(least, judge.BEYOND_DOUBT)
+    enough, still_there = max(least, judge.BEYOND_DOUBT), max(least, judge.STILL_THERE)
     tip = partial(_tip, frame, fields, config, prior, guess)
     model = judge.load()
 
@@ -93,7 +93,8 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     for n in _near(frame, images, fields, config, prior, guess, clock):
         f = measured(n.fit)
         attempt = Attempt(f, (None, None), *sized_up(n.sheet, f))
-        if n.alone and model.settles(attempt.log_odds, enough) and (guess is None or borne_out(f.curve(100), guess)):
+        if (n.alone and model.settles(attempt.log_odds, still_there)
+                and (guess is None or borne_out(f.curve(100), guess))):
             chosen, p, sheet = attempt, judge.probability(attempt.log_odds), n.sheet
             break
         leads.append(f)

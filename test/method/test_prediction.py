@@ -166,6 +166,7 @@ def test_tracking_that_the_prediction_contradicts_gives_way_to_it(scene, config,
     """Say tracking held on to the first half of the device only, and that was believed."""
     import fluoro_shape_ros.method.pipeline as pipeline
     real, config = pipeline.tracked, config.replace(min_confidence=0.0)
+    monkeypatch.setattr(pipeline.judge, 'STILL_THERE', 0.0)
     monkeypatch.setattr(pipeline.judge, 'BEYOND_DOUBT', 0.0)
 
     def half(*arguments):
