@@ -29,12 +29,12 @@ autodoc_typehints_format = 'short'
 
 def held(cls: type) -> list[str]:
     """What a class holds, for its docstring: the values of an enumeration, or a dataclass' fields, whose shapes and
-    units stand in a comment beside them."""
+    units stand in a comment beside them, and perhaps below that."""
     if issubclass(cls, Enum):
         return ['', ', '.join(f'`{member.value}`' for member in cls)]
-    fields = (re.findall(r'^    (\w+): [^#\n]*# *(.+)$', inspect.getsource(cls), re.MULTILINE)
+    fields = (re.findall(r'^    (\w+): [^#\n]*# *(.+(?:\n {5,}# .+)*)$', inspect.getsource(cls), re.MULTILINE)
               if is_dataclass(cls) else [])
-    return ['', *(f':param {name}: {words}' for name, words in fields)]
+    return ['', *(f':param {name}: ' + re.sub(r'\n +# ', ' ', words) for name, words in fields)]
 
 
 def as_it_is_written(app, what, name, obj, options, lines):

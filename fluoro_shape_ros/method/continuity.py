@@ -14,7 +14,7 @@ LEAPS = 1.0             # 1/s: how often it is elsewhere without having been see
 
 
 def continuity(points: np.ndarray, prior: Prior, stamp_ns: int) -> float:
-    """Nats that where the device was says for an (N, 3) curve, base to tip, in the pair of `stamp_ns`: at most 0, and 0
+    """Nats that where the device was says for an (N, 3) curve in the pair of `stamp_ns`: at most 0, and 0
     where that is not known.
 
     Within t it moves by FASTEST t + TIP, as a Gaussian has it beyond that, unless it has leapt, with the probability
@@ -23,7 +23,9 @@ def continuity(points: np.ndarray, prior: Prior, stamp_ns: int) -> float:
     if prior.previous is None or prior.previous_stamp_ns is None or stamp_ns <= prior.previous_stamp_ns:
         return 0.0
     seconds, before = 1e-9 * (stamp_ns - prior.previous_stamp_ns), prior.previous.points
-    far = max(float(cKDTree(before).query(points)[0].mean()), float(np.linalg.norm(points[-1] - before[-1])))
+    # which end is the tip is another question
+    tip = float(np.linalg.norm(points[[0, -1]] - before[-1], axis=1).min())
+    far = max(float(cKDTree(before).query(points)[0].mean()), tip)
     reach = FASTEST * seconds + TIP
     leap = -np.expm1(-LEAPS * seconds)
     return float(np.log(leap + (1 - leap) * np.exp(-0.5 * max(far / reach - 1, 0.0)**2)))

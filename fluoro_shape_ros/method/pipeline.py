@@ -85,7 +85,7 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
         last, _ = tip(f, alike)
         seen = features(f, sheet, radius, last)
         predicted = judge.PREDICTED if guess is not None and borne_out(f.curve(100), guess) else 0.0
-        was = continuity(f.curve(100)[::1 if last else -1], prior, frame.stamp_ns)
+        was = continuity(f.curve(100), prior, frame.stamp_ns)
         return seen, float(model.log_odds(seen)) + predicted + verdict(config.described, alike, f, last)[0] + was, last
 
     lines: Sequence[np.ndarray | None] = ()
@@ -127,8 +127,7 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     against, words = verdict(config.described, alike, f, last, config.detection.device)
     if against > min(CONTRADICTS, model.terms(chosen.features).min()):
         words = model.why(chosen.features, chosen.log_odds, p)
-    if continuity(f.curve(100)[::1 if last else -1], prior, frame.stamp_ns) < min(model.terms(chosen.features).min(),
-                                                                                  against):
+    if continuity(f.curve(100), prior, frame.stamp_ns) < min(model.terms(chosen.features).min(), against):
         words = 'it is far from where it was just before'
     if guess is not None and borne_out(f.curve(100), guess):
         f = informed(f, guess)

@@ -45,6 +45,10 @@ def test_beyond_its_reach_it_is_a_gaussian():
                     np.log(leap + (1 - leap) * np.exp(-0.5 * 1.5**2)), rtol=1e-9)
 
 
+def test_which_end_is_the_tip_is_another_question():
+    assert continuity(LINE[::-1], was(LINE), SECOND // 60) == 0
+
+
 def test_a_tip_that_leaps_along_the_device_counts_too():
     assert continuity(LINE[:20], was(LINE), SECOND // 60) < -2
 
