@@ -102,7 +102,8 @@ def _dated(path: Path, header, count: int) -> list[np.ndarray]:
         if count > 1 and all(keyword in frame for frame in frames):
             with reading(path, keyword):
                 dates = [DT(str(frame[keyword])) for frame in frames]
-                times = [round((date - dates[0]).total_seconds() * 1e6) * 1000 for date in dates]
+                # OverflowError: centuries apart
+                times = np.array([round((date - dates[0]).total_seconds() * 1e6) * 1000 for date in dates], np.int64)
             if all(early < late for early, late in pairwise(times)):
-                found.append(np.array(times, np.int64))
+                found.append(times)
     return found

@@ -274,3 +274,13 @@ def test_a_field_of_view_of_enhanced_xa():
 def test_functional_groups_that_do_not_do_are_named(angles, says):
     with pytest.raises(BadDicom, match=says):
         dicom.read_run(enhanced('run.dcm', FRAMES, angles))
+
+
+def test_frames_that_are_centuries_apart_are_named():
+    """What a fuzzer found: nanoseconds of 64 bits hold 292 years."""
+    header = pydicom.dcmread(enhanced('run.dcm', FRAMES, [0.0] * 3, [0.1, 0.2, 0.3]))
+    groups = header.PerFrameFunctionalGroupsSequence
+    groups[-1].FrameContentSequence[0].FrameAcquisitionDateTime = '24260102121314'
+    header.save_as('run.dcm')
+    with pytest.raises(BadDicom, match='run.dcm: damaged: FrameAcquisitionDateTime can\'t be read'):
+        dicom.read_run('run.dcm')
