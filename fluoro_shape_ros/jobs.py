@@ -15,11 +15,12 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 import cv2
 
+from .child_process import end_with
 from .cli import ToolError, need
 
 ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
@@ -67,6 +68,7 @@ def _one_thread_children():
 
 
 def _start_child() -> None:
+    end_with(parent_process().pid)      # which may be killed
     signal.signal(signal.SIGINT, signal.SIG_IGN)    # Ctrl-C is the parent's to answer
     cv2.setNumThreads(1)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 STEEP = 3.0             # median gradients, that an edge has at least
 SHORTEST = 0.25         # of an image's smaller side, that the edge of a blade is long;
-                        # half of it where there is no other
+                        # twice that where no other is parallel or at right angles
 ALIGNED = 0.9           # cosine of the angle between an edge and where it should run
 MAYBE, SEEN = 0.5, 0.7  # share of an outline that must be an edge, where one could be seen: at all, and where the
                         # others leave it exposed
@@ -72,6 +72,8 @@ class Outline:
 
 def outlines(image: np.ndarray) -> list[Outline]:
     """Of the exposed field in an (h, w) float32 image; none where it is exposed everywhere."""
+    if min(image.shape) < 2 * WIDE_PX:
+        return []       # too small to tell a blade from a device
     edges, shortest = Edges.of(image), SHORTEST * min(image.shape)
     found: list[Outline] = []
     candidates = [o for o in (*_straight(edges, shortest), *_round(edges, shortest))

@@ -41,7 +41,7 @@ def _is_bright(image: np.ndarray) -> bool:
     What deviates from the local level counts in local standard deviations, so that neither blades nor bright parts of
     the patient outweigh a device.
     """
-    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, [-(-n // 2) for n in image.shape[::-1]], interpolation=cv2.INTER_AREA)
     field = cv2.erode(field_of_view(small, 'auto'), np.ones((LOCAL_PX, LOCAL_PX), np.uint8),
                       borderType=cv2.BORDER_CONSTANT, borderValue=255)
     detail = cv2.GaussianBlur(small, (0, 0), FINE_PX)

@@ -3,12 +3,9 @@ it does, however that ends."""
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import gc
-import os
 import pickle
-import signal
 import sys
 import time
 from dataclasses import replace
@@ -17,13 +14,13 @@ from multiprocessing.connection import Connection
 
 import cv2
 
+from ..child_process import end_with
 from ..data import Frame, Reconstruction
 from ..method import judge
 from ..method.pipeline import reconstruct
 from .reconstruction_process import READY, Bug, Task
 from .shared_arrays import SeenArrays
 
-PR_SET_PDEATHSIG = 1    # prctl(2)
 COLLECT_S = 1.0         # between two collections of garbage, which wait for an answer to be out
 
 _known = lru_cache(8)(pickle.loads)     # the same bytes are the same objects, of which other caches know
@@ -42,13 +39,6 @@ def main(argv: list[str]) -> int:
         except (EOFError, BrokenPipeError, ConnectionResetError):   # nobody is there any more
             pass
     return 0
-
-
-def end_with(parent: int) -> None:
-    """Have the kernel kill this process when the thread that began it ends; at once where it has."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        sys.exit(0)
 
 
 def serve(connection: Connection, images: SeenArrays, masks: SeenArrays) -> None:

@@ -4,10 +4,15 @@ in between."""
 import math
 import os
 import signal
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from cluster import HOST, PATIENCE_S, Cluster, free_port
+from processes import gone
 from test_bench_variety import drawn, hide, save
 
 from fluoro_shape_ros import jobs
@@ -29,6 +34,25 @@ def test_processes_keep_the_order_and_have_one_thread():
     assert list(jobs.in_order(eval, ['3 * 7', THREADS, *(f'__import__("os").environ["{name}"]'
                                                          for name in jobs.ONE_THREAD)], 2)) == [21, 1, '1', '1', '1']
     assert {name: os.environ.get(name) for name in jobs.ONE_THREAD} == before
+
+
+def test_they_end_with_the_process_that_began_them_however_that_ends():
+    code = """if __name__ == '__main__':
+        import os, sys
+        from fluoro_shape_ros import jobs
+        results = jobs.in_order(eval, ['__import__("os").getpid()', '__import__("time").sleep(600)'], 1)
+        print(next(results), flush=True)
+        next(results)"""
+    places = [str(Path(jobs.__file__).parents[1]), os.environ.get('PYTHONPATH', '')]
+    with subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE,
+                          env={**os.environ, 'PYTHONPATH': os.pathsep.join(places)}) as parent:
+        pid = int(parent.stdout.readline())
+        assert not gone(pid)
+        parent.kill()
+    deadline = time.monotonic() + 60
+    while not gone(pid) and time.monotonic() < deadline:
+        threading.Event().wait(0.005)
+    assert gone(pid)
 
 
 def test_what_a_task_raises_comes_out_and_a_dead_process_is_named():

@@ -165,3 +165,11 @@ def test_blades_and_bones_do_not_tell_a_bright_device_from_a_dark_one(name):
     image = np.clip(np.where(dark, 4, light) + rng.normal(0, 2, light.shape), 0, 255).astype(np.uint8)
     assert (dark_device(image, 'auto') == image).all()
     assert (dark_device(255 - image, 'auto') == image).all()
+
+
+@pytest.mark.parametrize('h, w', [(1, 1), (2, 3), (8, 8), (3, 2000), (17, 40), (700, 90)])
+@pytest.mark.parametrize('polarity', ['dark', 'bright', 'auto'])
+def test_an_image_of_any_size_has_a_field(h, w, polarity):
+    image = np.random.default_rng(h).integers(0, 256, (h, w)).astype(np.uint8)
+    assert (field_of_view(image, polarity) == 255).all()
+    assert dark_device(image, polarity).shape == image.shape
