@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from ..geometry.curve import middle as middle_of
+
 STEEP = 3.0             # median gradients, that an edge has at least
 SHORTEST = 0.25         # of an image's smaller side, that the edge of a blade is long;
                         # twice that where no other is parallel or at right angles
@@ -126,7 +128,7 @@ class Edges:
         gradient = [cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3, borderType=cv2.BORDER_REPLICATE)
                     for d in ((1, 0), (0, 1))]
         steep = cv2.magnitude(*gradient)
-        least = max(STEEP * float(np.median(steep[::2, ::2])), float(steep.max()) / FAINTEST, 1e-12)
+        least = max(STEEP * float(middle_of(steep[::2, ::2].ravel())), float(steep.max()) / FAINTEST, 1e-12)
         thin = cv2.Canny(*((g * (CANNY / least)).astype(np.int16) for g in gradient), CANNY, 2 * CANNY, L2gradient=True)
         bright = cv2.merge(gradient) / (steep + 1e-12)[..., None]
         blocks = cv2.resize(thin, None, fx=1 / BLOCK_PX, fy=1 / BLOCK_PX, interpolation=cv2.INTER_AREA) > 0
@@ -207,7 +209,8 @@ def _round(edges: Edges, shortest: float) -> Iterator[Outline]:
         coarse = k < STEPS // 2
         rim = ((to * n).sum(axis=1) > POINTS[not coarse] * r) & (r > shortest / 2)
         if not coarse and rim.any():
-            rim &= np.abs(r - np.median(r[rim])) < RIM * np.median(r[rim])
+            usual = middle_of(r[rim])
+            rim &= np.abs(r - usual) < RIM * usual
         if np.count_nonzero(rim) < 3:
             return
         # least squares: the lines through the edges along their gradients meet there
