@@ -65,6 +65,14 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Searched:
+    """What the last search of whole images found."""
+
+    log_odds: float     # of the curve that was chosen
+    rivals: float       # sum of the odds of curves that exclude it
+
+
+@dataclass(frozen=True)
 class Prior:
     """What is known before a pair is looked at; everything is optional."""
 
@@ -78,6 +86,7 @@ class Prior:
                                             # or where there is none
     search: Any = None                      # a method.search.Search of an earlier pair that was cut short,
                                             # to go on with
+    searched: Searched | None = None        # if it led to the previous result
 
 
 @dataclass(frozen=True)
@@ -146,6 +155,8 @@ class Reconstruction:
                                                         # of the best curve tried; NaN: none was, or not known
 
     search: Any = None                                  # a method.search.Search that was cut short
+    searched: Searched | None = None                    # what was found beside the shape, in this pair or an earlier
+                                                        # one; None: whole images were not searched to the end
     landmarks: Landmarks | None = None                  # of the curve, of a rejected pair too; None: there is none, or
                                                         # the method finds none
 

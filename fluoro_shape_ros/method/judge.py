@@ -26,7 +26,8 @@ from .features import NAMES
 
 # confidences from which on nothing else is tried, unless min_confidence asks for more: no other line in the whole
 # images, where a better one may not have been tried yet, and none beside a curve near where the device was
-BEYOND_DOUBT, STILL_THERE = 0.99, 0.97
+BEYOND_DOUBT, STILL_THERE = 0.98, 0.97
+FLUCTUATES = 1.0        # nats that the odds of one curve vary by from pair to pair, as noise and background do
 PREDICTED = 1.0         # what a prediction that a curve bears out adds to its log odds
 # scales: what is worse by less says nothing, by more it says more, and in the end no more
 NEAR, FAR, LIMIT = 0.7, 2.0, 6.0
@@ -89,8 +90,10 @@ def worse(features: np.ndarray, typical: np.ndarray, scale: np.ndarray) -> tuple
     return np.maximum(u - NEAR, 0), np.maximum(u - FAR, 0)
 
 
-def probability(log_odds: float) -> float:
-    return float(1 / (1 + np.exp(-np.clip(log_odds, -30, 30))))
+def probability(log_odds: float, rivals: float = 0.0) -> float:
+    """Of a curve with the odds o beside others that exclude it and one another, the sum of whose odds is `rivals`: at
+    most one of them is right, so that it is o / (1 + o + rivals) by Bayes' rule."""
+    return float(1 / (1 + (1 + rivals) * np.exp(-np.clip(log_odds, -30, 30))))
 
 
 @lru_cache(1)

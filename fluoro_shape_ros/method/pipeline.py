@@ -10,7 +10,7 @@ from functools import cache, partial
 import numpy as np
 
 from ..config import Config
-from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Shape, View
+from ..data import Centerline, Frame, Outcome, Prior, Reconstruction, Searched, Shape, View
 from ..geometry.cameras import GeometryError, check, distort, pixels_per_metre, project, undistort
 from ..geometry.curve import arc_length, distance_to, resample
 from ..imaging.field import border_distance, common_field
@@ -33,6 +33,7 @@ from .tracking import Near, predicted, tracked
 from .user_bounds import check_curvature, check_length, check_reprojection, check_tip, curvature_limit
 
 BORDER_PX = 12.0        # an end this near to the field's border runs out of it
+RATHER = 0.5            # confidence below which a curve is rather wrong than right
 CURVE = 400             # points of a fit, that its darkness is looked at along
 # what a longer search might have answered
 OPEN = {Outcome.NO_DEVICE_A, Outcome.NO_DEVICE_B, Outcome.NO_CORRESPONDENCE, Outcome.LOW_CONFIDENCE}
@@ -74,7 +75,6 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     measured: what is made of a Fit before it is judged.
     """
     radius, polarity, least = config.radius, config.detection.polarity, config.plausibility.min_confidence
-    enough, still_there = max(least, judge.BEYOND_DOUBT), max(least, judge.STILL_THERE)
     tip = partial(_tip, frame, fields, config, prior, guess)
     model = judge.load()
 
@@ -89,21 +89,22 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
         return seen, float(model.log_odds(seen)) + predicted + verdict(config.described, alike, f, last)[0] + was, last
 
     lines: Sequence[np.ndarray | None] = ()
-    leads, chosen, unfinished = [], None, None
+    leads, chosen, unfinished, searched = [], None, None, prior.searched
     for n in _near(frame, images, fields, config, prior, guess, clock):
         f = measured(n.fit)
         attempt = Attempt(f, (None, None), *sized_up(n.sheet, f))
-        if (n.alone and model.settles(attempt.log_odds, still_there)
-                and (guess is None or borne_out(f.curve(100), guess))):
-            chosen, p, sheet = attempt, judge.probability(attempt.log_odds), n.sheet
-            break
+        if n.alone and (guess is None or borne_out(f.curve(100), guess)):
+            p = _stands(attempt.log_odds, model, least, searched)
+            if p is not None:
+                chosen, sheet = attempt, n.sheet
+                break
         leads.append(f)
     if chosen is None:
         sheet = sheet_of(images, fields, frame.views, polarity)
         sized = partial(sized_up, sheet)
         if prior.search is None or guess is not None:
             search = Search(sheet, radius, config.detection.min_length_px, sized,
-                            lambda odds: model.settles(odds, enough), guess, leads,
+                            lambda odds: model.settles(odds, max(least, judge.BEYOND_DOUBT)), guess, leads,
                             lambda points: float(model.log_odds(at_first_sight(points, sheet, radius))), measured)
             search.go_on(clock.late)
             tried = search.tried
@@ -116,10 +117,12 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
         clock.lap('search')
         if not tried:
             return replace(_nothing(lines, config, clock), search=unfinished)
-        chosen, p = choose(tried)
+        chosen, rivals = choose(tried)
+        p = judge.probability(chosen.log_odds, rivals)
+        searched = Searched(chosen.log_odds, rivals) if search.finished else None
 
     f, confidence = chosen.fit, model.confidence(p)
-    if confidence < min(least, 0.5) and any(line is None for line in lines):     # rather wrong than right
+    if confidence < min(least, RATHER) and any(line is None for line in lines):
         return replace(_nothing(lines, config, clock), confidence=confidence, search=unfinished)
     seen = tuple(Centerline(projected(f, v) if c is None else c.points_px) for v, c in zip(frame.views, chosen.lines))
     alike = _alike(f.curve(CURVE), sheet, config)
@@ -138,7 +141,18 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
         return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence,
                               search=unfinished, landmarks=places)
     return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps,
-                          confidence=confidence, landmarks=places)
+                          confidence=confidence, searched=searched, landmarks=places)
+
+
+def _stands(log_odds: float, model: judge.Judge, least: float, searched: Searched | None) -> float | None:
+    """The probability that a curve near where the device was is right, if no search of whole images is called for: it
+    is beyond doubt by itself, or about as likely as when one was made, beside what else that found. Else None."""
+    if model.settles(log_odds, max(least, judge.STILL_THERE)):
+        return judge.probability(log_odds)
+    if searched is None or log_odds < searched.log_odds - judge.FLUCTUATES:
+        return None
+    p = judge.probability(log_odds, searched.rivals)
+    return p if model.confidence(p) >= max(least, RATHER) else None
 
 
 def _near(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior,

@@ -194,15 +194,13 @@ def at_rest(sheet: Sheet, fitted: Fit | None, radius: float, **options: Any) -> 
 
 
 def choose(tried: Sequence[Attempt]) -> tuple[Attempt, float]:
-    """The likeliest attempt, and the probability that it is right: of curves that exclude one another at most one can
-    be, by Bayes' rule p = o / (1 + sum of odds)."""
-    ranked = sorted(tried, key=lambda t: -t.log_odds)
-    best, rivals = ranked[0], list[Attempt]()
-    for t in ranked[1:]:
+    """The likeliest attempt, and the sum of the odds of the likeliest others that exclude it and one another."""
+    best, *others = sorted(tried, key=lambda t: -t.log_odds)
+    rivals = list[Attempt]()
+    for t in others:
         if all(exclusive(t, r) for r in (best, *rivals)):
             rivals.append(t)
-    odds = np.exp(np.clip([best.log_odds, *(r.log_odds for r in rivals)], -30, 30))
-    return best, float(odds[0] / (1 + odds.sum()))
+    return best, float(np.exp(np.clip([r.log_odds for r in rivals], -30, 30)).sum())
 
 
 def exclusive(a: Attempt, b: Attempt) -> bool:

@@ -148,6 +148,7 @@ class Memory:
         self._lock = threading.Lock()
         self._last: deque[tuple[Shape, int, str]] = deque(maxlen=2)     # shape, stamp, frame
         self._search = None     # one of whole images that was cut short
+        self._searched = None   # what the last one found, if it led to the last shape
         self._sums, self._taken, self._wanted = None, 0, 0
         self._masks, self._window = None, None      # what was captured, and the images it fits
         self.generation = 0     # a result that was begun in an earlier one is out of date
@@ -158,7 +159,7 @@ class Memory:
         with self._lock:
             self.generation += 1
             self._last.clear()
-            self._search = None
+            self._search = self._searched = None
 
     def capture_mask(self, pairs: int) -> None:
         """The next `pairs` pairs become the mask."""
@@ -215,7 +216,8 @@ class Memory:
                      if job.config.curve.tracking and frame_id == frame.frame_id]
             before, previous = [(None, None)] * (2 - len(known)) + known
             points, fault = _predicted(job, frame)
-            return Prior(previous[0], previous[1], before[0], before[1], self._masks, points, fault, self._search)
+            return Prior(previous[0], previous[1], before[0], before[1], self._masks, points, fault, self._search,
+                         self._searched if known else None)
 
     def remember(self, job: Job, frame: Frame, result: Reconstruction) -> bool:
         """Keep the shape of a result for the next pair; False where the result is out of date and must not be
@@ -223,7 +225,7 @@ class Memory:
         with self._lock:
             if job.generation != self.generation:
                 return False
-            self._search = result.search
+            self._search, self._searched = result.search, result.searched
             if result.shape is not None:
                 self._last.append((result.shape, frame.stamp_ns, frame.frame_id))
             return True

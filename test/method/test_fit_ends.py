@@ -48,6 +48,22 @@ def test_the_longer_of_two_pieces_counts():
     assert_allclose(stretch(presence(apart, apart)), (290, 399), atol=1)
 
 
+@pytest.mark.parametrize('step_px', [1, 3])
+def test_a_stretch_is_never_a_strip_alone(step_px):
+    """What one strip shows is noise; a curve of no length stopped the fit."""
+    found = 0
+    for seed in range(3000):
+        rng = np.random.default_rng(seed)
+        count, height = rng.integers(6, 60), rng.uniform(0, 1.5)
+        seen = rng.normal(0, rng.uniform(0.1, 1.5), (count, 2))
+        first, last = np.sort(rng.integers(0, count, 2))
+        seen[first:last + 1] += height
+        there = supported(seen, np.full((2, 1), rng.uniform(0.02, 0.5)), step_px)
+        found += there is not None
+        assert there is None or (there[1] - there[0]) * step_px >= 5
+    assert found > 100
+
+
 @pytest.mark.parametrize('a, b', [([], []), ([(50, 149)], [(200, 299)]), ([(50, 52)], [(50, 52)])])
 def test_without_common_support_there_is_no_stretch(a, b):
     assert stretch(presence(a, b)) is None

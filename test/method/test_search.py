@@ -109,6 +109,12 @@ def of(odds, points=LINE):
     return Attempt(SimpleNamespace(curve=at, s=np.array([0.0, 1e-4])), (None, None), np.zeros(0), odds, True)
 
 
+def likeliest(tried):
+    """The chosen one, and the probability that it is right."""
+    best, rivals = choose(tried)
+    return best, judge.probability(best.log_odds, rivals)
+
+
 @pytest.mark.parametrize('other, expected', [
     # the other way round
     (LINE, False), (LINE + [1.9 * MEAN, 0, 0], False), (LINE + [2.1 * MEAN, 0, 0], True), (LINE[::-1], True),
@@ -122,26 +128,26 @@ def test_which_curves_exclude_one_another(other, expected):
 @pytest.mark.parametrize('a, b', [(3.0, 1.0), (1.0, 3.0), (0.5, 0.5), (-2.0, -4.0)])
 def test_of_two_curves_that_lie_apart_only_one_can_be_right(a, b):
     tried = [of(a), of(b, LINE + [3 * MEAN, 0, 0])]
-    best, p = choose(tried)
+    best, p = likeliest(tried)
     assert best.log_odds == max(a, b) and p == pytest.approx(np.exp(max(a, b)) / (1 + np.exp(a) + np.exp(b)))
 
 
 def test_two_that_coincide_do_not_compete():
-    best, p = choose([of(1.0), of(1.5, LINE + [0.5 * MEAN, 0, 0]), of(1.2, LINE[5:])])
+    best, p = likeliest([of(1.0), of(1.5, LINE + [0.5 * MEAN, 0, 0]), of(1.2, LINE[5:])])
     assert best.log_odds == 1.5 and p == pytest.approx(np.exp(1.5) / (1 + np.exp(1.5))) == judge.probability(1.5)
 
 
 def test_of_rivals_that_coincide_the_likeliest_counts():
     rivals = [of(1.0, LINE + [0.005, 0, 0]), of(0.7, LINE + [0.0055, 0, 0]), of(-1.0, LINE - [0.005, 0, 0])]
     for tried in ([of(2.0), *rivals], [*rivals[::-1], of(2.0)]):
-        best, p = choose(tried)
+        best, p = likeliest(tried)
         assert best.log_odds == 2 and p == pytest.approx(np.exp(2) / (1 + np.exp(2) + np.exp(1) + np.exp(-1)))
 
 
 def test_odds_beyond_all_measure_are_still_odds():
-    assert choose([of(5000.0)])[1] == pytest.approx(1)
-    assert choose([of(5000.0), of(5000.0, LINE + [0.01, 0, 0])])[1] == pytest.approx(0.5)
-    assert 0 < choose([of(-5000.0)])[1] < 1e-9
+    assert likeliest([of(5000.0)])[1] == pytest.approx(1)
+    assert likeliest([of(5000.0), of(5000.0, LINE + [0.01, 0, 0])])[1] == pytest.approx(0.5)
+    assert 0 < likeliest([of(-5000.0)])[1] < 1e-9
 
 
 # ---- when a search ends
@@ -206,7 +212,7 @@ def test_a_lead_in_doubt_competes_with_what_is_found(chosen, sheet):
     part = replace(chosen.fit, stop=chosen.fit.start + 0.6 * (chosen.fit.stop - chosen.fit.start))
     tried, _ = searched(sheet, leads=[part], settles=never)
     assert tried[0].fit is part and len(tried) > 1
-    best, p = choose(tried)
+    best, p = likeliest(tried)
     assert best.fit is not part and p < judge.probability(best.log_odds)
 
 

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.config import Config
-from fluoro_shape_ros.data import Prior
-from fluoro_shape_ros.method.pipeline import reconstruct
+from fluoro_shape_ros.data import Prior, Searched
+from fluoro_shape_ros.method import judge
+from fluoro_shape_ros.method.pipeline import _stands, reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
 from fluoro_shape_ros.sim.shapes import posed
@@ -143,3 +144,29 @@ def test_without_tracking_the_previous_shape_changes_nothing():
     plain, given = reconstruct(scene.frame, config), reconstruct(scene.frame, config,
                                                                  Prior(previous=search(scene).shape))
     assert 'track' not in given.stage_seconds and np.array_equal(plain.shape.points, given.shape.points)
+
+
+def test_what_stands_as_it_stood_when_everything_was_searched_needs_no_other_search(monkeypatch):
+    monkeypatch.setattr(judge, 'STILL_THERE', 1.1)      # as if nothing near where it was were beyond doubt by itself
+    first, second, third = pictures([moved(k * 0.1 * STEP) for k in range(3)])
+    found = search(first)
+    known = Prior(found.shape, first.frame.stamp_ns, searched=found.searched)
+    answer = reconstruct(second.frame, CONFIG, known)
+    assert is_right(answer, second) and 'search' not in answer.stage_seconds and answer.searched is found.searched
+    likelier = replace(found.searched, log_odds=found.searched.log_odds + 2.0)
+    for prior in (replace(known, searched=None), replace(known, searched=likelier)):
+        again = reconstruct(second.frame, CONFIG, prior)
+        assert 'search' in again.stage_seconds and again.searched.log_odds != likelier.log_odds
+
+
+@pytest.mark.parametrize('nats, rivals, stands', [
+    (0.0, 0.0, True), (-0.9, 0.0, True), (-1.1, 0.0, False),    # as it was, a little and much less likely
+    (0.0, 1.0, True), (0.0, 100.0, False)])                     # beside others that nobody would publish it
+def test_how_a_curve_stands_beside_what_was_found_before(nats, rivals, stands):
+    model, odds = judge.load(), np.log(0.9 / 0.1)
+    least = 0.7
+    searched = Searched(odds, rivals)
+    p = _stands(odds + nats, model, least, searched)
+    assert (p is not None) == stands
+    assert not stands or p == pytest.approx(1 / (1 + (1 + rivals) * np.exp(-odds - nats)))
+    assert _stands(odds, model, least, None) is None or model.settles(odds, judge.STILL_THERE)

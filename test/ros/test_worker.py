@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fluoro_shape_ros.config import Config
-from fluoro_shape_ros.data import Frame, Outcome, Reconstruction, Shape
+from fluoro_shape_ros.data import Frame, Outcome, Reconstruction, Searched, Shape
 from fluoro_shape_ros.ros.worker import (
     Job,
     Memory,
@@ -148,6 +148,20 @@ def test_the_shape_before_the_last_is_remembered_too():
     memory.remember(the_job, replace(adapt(the_job, view_of, no_lookup, Tally()), stamp_ns=9), later)
     prior = recall(memory)
     assert (prior.previous, prior.previous_stamp_ns, prior.before, prior.before_stamp_ns) == (later.shape, 9, SHAPE, 5)
+
+
+def test_what_a_search_found_is_remembered_as_long_as_the_shape_it_led_to():
+    memory, found = Memory(), Searched(3.0, 0.5)
+    the_job = job(generation=memory.generation)
+    frame = adapt(the_job, view_of, no_lookup, Tally())
+    memory.remember(the_job, frame, replace(GOOD, searched=found))
+    assert recall(memory).searched is found
+    assert recall(memory, tracking=False).searched is recall(memory, reference_frame='cell').searched is None
+    memory.remember(the_job, frame, Reconstruction(Outcome.LOW_CONFIDENCE))
+    assert recall(memory).previous is SHAPE and recall(memory).searched is None
+    memory.remember(the_job, frame, replace(GOOD, searched=found))
+    memory.reset()
+    assert recall(memory).searched is None
 
 
 def test_a_result_begun_before_a_reset_is_out_of_date():

@@ -61,7 +61,7 @@ def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1,
     dark = _both_show(presence.T, max(SMOOTH_PX // step_px, 1))[start:stop]
     near = max(LOCAL_PX // step_px, 1)
     first, last = (int((d > PRESENT * max(d[:near].max(), 1e-9)).argmax()) for d in (dark, dark[::-1]))
-    return (start + first, stop - 1 - last) if first + last < stop - start else None
+    return (start + first, stop - 1 - last) if (stop - 1 - last - start - first) * step_px >= 5 else None
 
 
 def level(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, float]:
