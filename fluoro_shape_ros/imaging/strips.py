@@ -17,6 +17,8 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over
                         # TOGETHER strips
 PALER, DARKER = 0.15, 4.0       # times as dark as it usually is, that a part of a device may be
+SURELY = 3.0            # standard deviations
+PALE = 0.4              # times as dark as usual, that the line found in a strip at least is
 FOUND_PX = 0.3          # what `search` is worth
 MARGIN_PX = 4           # of a Sheet: interpolation reaches 2 px
 SMOOTHED = 4            # px to either side, over which a line seen pixel by pixel is smoothed
@@ -227,9 +229,11 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     usual = np.stack([_running_median(d, i)
                       for d, i in zip(darkness, inside if reference is None else inside & reference)])
     usual[~(usual > 1e-9)] = np.nan     # no darkness at all, or brighter than its surroundings: no device to measure
-    offset = coefficients[..., 4] / usual
     gain = np.sqrt((fit * fit).sum(axis=2))
-    variance = (noise * gain[:, 4:] / usual) ** 2
+    # a band is by far darker than the rest: what surely is darker than usual counts as it is
+    dark = np.fmax(usual, darkness - SURELY * noise * gain[:, 3:4])
+    offset = coefficients[..., 4] / dark
+    variance = (noise * gain[:, 4:]) ** 2 / (usual * dark)   # it may be another line's, too
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.
     square = rest * rest
     limit = 9 * noise**2
@@ -285,7 +289,7 @@ def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:
     usual = np.array([max(float(middle(d[i])) if i.any() else 1.0, 1e-9)
                       for d, i in zip(darkest, strips.inside)])[:, None]
     strength = darkest / usual
-    believed = strips.inside & (strength > 0.4) & (strength < 2.5)
+    believed = strips.inside & (strength > PALE)
     unknown = np.ones(len(strength))
     return Measurement(strips.offsets_px[inner][best] + np.clip(beside, -0.5, 0.5),
                        np.where(believed, FOUND_PX**2, np.inf), strength, unknown, unknown,
