@@ -86,7 +86,7 @@ class Prior:
                                             # or where there is none
     search: Any = None                      # a method.search.Search of an earlier pair that was cut short,
                                             # to go on with
-    searched: Searched | None = None        # if it led to the previous result
+    searched: Searched | None = None        # as it came with the pair before
 
 
 @dataclass(frozen=True)
@@ -155,8 +155,8 @@ class Reconstruction:
                                                         # of the best curve tried; NaN: none was, or not known
 
     search: Any = None                                  # a method.search.Search that was cut short
-    searched: Searched | None = None                    # what was found beside the shape, in this pair or an earlier
-                                                        # one; None: whole images were not searched to the end
+    searched: Searched | None = None                    # what whole images showed in this pair, or in an earlier one
+                                                        # if that sufficed; None: they were not searched to the end
     landmarks: Landmarks | None = None                  # of the curve, of a rejected pair too; None: there is none, or
                                                         # the method finds none
 

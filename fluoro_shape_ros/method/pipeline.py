@@ -139,7 +139,7 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
     doubt = (Outcome.LOW_CONFIDENCE, words) if confidence < least else _doubt(shape, config, frame)
     if doubt:
         return Reconstruction(*doubt, centerlines=seen, stage_seconds=clock.laps, confidence=confidence,
-                              search=unfinished, landmarks=places)
+                              search=unfinished, searched=searched, landmarks=places)
     return Reconstruction(Outcome.OK, 'ok', shape, ('tip_ambiguous',) if guessed else (), seen, clock.laps,
                           confidence=confidence, searched=searched, landmarks=places)
 
@@ -152,7 +152,7 @@ def _stands(log_odds: float, model: judge.Judge, least: float, searched: Searche
     if searched is None or log_odds < searched.log_odds - judge.FLUCTUATES:
         return None
     p = judge.probability(log_odds, searched.rivals)
-    return p if model.confidence(p) >= max(least, RATHER) else None
+    return p if model.confidence(p) >= RATHER else None     # if it is refused, another search would refuse it, too
 
 
 def _near(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.ndarray], config: Config, prior: Prior,

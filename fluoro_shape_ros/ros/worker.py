@@ -148,7 +148,7 @@ class Memory:
         self._lock = threading.Lock()
         self._last: deque[tuple[Shape, int, str]] = deque(maxlen=2)     # shape, stamp, frame
         self._search = None     # one of whole images that was cut short
-        self._searched = None   # what the last one found, if it led to the last shape
+        self._searched = None   # what the last one found, as long as that suffices
         self._sums, self._taken, self._wanted = None, 0, 0
         self._masks, self._window = None, None      # what was captured, and the images it fits
         self.generation = 0     # a result that was begun in an earlier one is out of date

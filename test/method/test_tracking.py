@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.config import Config
-from fluoro_shape_ros.data import Prior, Searched
+from fluoro_shape_ros.data import Outcome, Prior, Searched
 from fluoro_shape_ros.method import judge
 from fluoro_shape_ros.method.pipeline import _stands, reconstruct
 from fluoro_shape_ros.sim.carm import CArm, biplane
@@ -157,6 +157,10 @@ def test_what_stands_as_it_stood_when_everything_was_searched_needs_no_other_sea
     for prior in (replace(known, searched=None), replace(known, searched=likelier)):
         again = reconstruct(second.frame, CONFIG, prior)
         assert 'search' in again.stage_seconds and again.searched.log_odds != likelier.log_odds
+    # what is refused as it was, another search would refuse, too
+    refused = reconstruct(second.frame, CONFIG.replace(min_confidence=0.9995), known)
+    assert refused.outcome is Outcome.LOW_CONFIDENCE and refused.searched is found.searched
+    assert 'search' not in refused.stage_seconds
 
 
 @pytest.mark.parametrize('nats, rivals, stands', [
@@ -164,9 +168,7 @@ def test_what_stands_as_it_stood_when_everything_was_searched_needs_no_other_sea
     (0.0, 1.0, True), (0.0, 100.0, False)])                     # beside others that nobody would publish it
 def test_how_a_curve_stands_beside_what_was_found_before(nats, rivals, stands):
     model, odds = judge.load(), np.log(0.9 / 0.1)
-    least = 0.7
-    searched = Searched(odds, rivals)
-    p = _stands(odds + nats, model, least, searched)
+    p = _stands(odds + nats, model, 0.7, Searched(odds, rivals))
     assert (p is not None) == stands
     assert not stands or p == pytest.approx(1 / (1 + (1 + rivals) * np.exp(-odds - nats)))
-    assert _stands(odds, model, least, None) is None or model.settles(odds, judge.STILL_THERE)
+    assert _stands(odds, model, 0.7, None) is None
