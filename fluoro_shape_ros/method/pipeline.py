@@ -94,9 +94,9 @@ def _by_spline(frame: Frame, images: Sequence[np.ndarray], fields: Sequence[np.n
         f = measured(n.fit)
         attempt = Attempt(f, (None, None), *sized_up(n.sheet, f))
         if n.alone and (guess is None or borne_out(f.curve(100), guess)):
-            p = _stands(attempt.log_odds, model, least, searched)
-            if p is not None:
-                chosen, sheet = attempt, n.sheet
+            stands = _stands(attempt.log_odds, model, least, searched)
+            if stands is not None:
+                chosen, p, sheet = attempt, stands, n.sheet
                 break
         leads.append(f)
     if chosen is None:

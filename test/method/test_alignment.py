@@ -30,7 +30,7 @@ def seen(X):
 
 
 def match(a, b, **options):
-    return align(a, b, [np.ones(len(a)), np.ones(len(b))], F, **options)
+    return list(align(a, b, [np.ones(len(a)), np.ones(len(b))], F, **options))
 
 
 def apart(found, X):
@@ -96,7 +96,7 @@ def test_the_partner_is_found_among_others():
 def test_weights_tip_the_balance_between_equals():
     a, b = seen(CURVES['monotone'])
     for weights, wins in (([1.0, 0.5], 0), ([0.5, 1.0], 1)):
-        assert align([a], [b, b], [np.ones(1), np.array(weights)], F)[0].b == wins
+        assert next(align([a], [b, b], [np.ones(1), np.array(weights)], F)).b == wins
 
 
 def test_curves_that_share_no_epipolar_line_do_not_match():
@@ -104,3 +104,20 @@ def test_curves_that_share_no_epipolar_line_do_not_match():
     assert not match([a], [b + [0, 150.0]])
     assert not match([a], [])
     assert not match([], [b])
+
+
+def test_of_many_curves_the_best_come_first_however_many_are_asked_for():
+    rng = np.random.default_rng(3)
+    pairs = [seen(X + rng.normal(0, 0.01, 3)) for X in CURVES.values() for _ in range(3)]
+    a, b = zip(*pairs)
+    weights = [rng.uniform(0.1, 1.0, len(pairs)) for _ in 'ab']
+    found = list(align(a, b, weights, F, best=40))
+    scores = [x.score for x in found]
+    assert len(found) > 10 and scores == sorted(scores, reverse=True)
+    assert [(x.a, x.b, x.flipped) for x in align(a, b, weights, F, best=3)] == [(x.a, x.b, x.flipped)
+                                                                                 for x in found[:3]]
+    # and one by one, so that nothing is left out because it was looked at late
+    alone = {(i, j): x.score for i in range(len(a)) for j in range(len(b))
+             for x in align([a[i]], [b[j]], [weights[0][i:i + 1], weights[1][j:j + 1]], F, best=1)}
+    assert scores[0] == pytest.approx(max(alone.values()), rel=1e-5)
+    assert sum(s >= scores[-1] * 1.0001 for s in alone.values()) <= len(found)

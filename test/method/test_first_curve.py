@@ -28,7 +28,7 @@ def first(X, views, flipped=False, noise_px=0.0):
     a, b = (line + rng.normal(0, noise_px, line.shape) for line in (a, b))
     if flipped:
         b = b[::-1]
-    found = align([a], [b], [np.ones(1), np.ones(1)], fundamental(views[0].P, views[1].P))[0]
+    found = next(align([a], [b], [np.ones(1), np.ones(1)], fundamental(views[0].P, views[1].P)))
     return first_curve(views, a, b, found)
 
 

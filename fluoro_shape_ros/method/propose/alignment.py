@@ -8,7 +8,11 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from heapq import heappop, heappush
+from itertools import count
 
 import numpy as np
 
@@ -18,6 +22,7 @@ from ...geometry.curve import arc_length, at_arc_length
 SAMPLES = 64            # points a curve in the alignment
 TOLERANCE_PX = 3.0      # epipolar distance at which a point gains nothing
 WORST = -1.5            # the most a point costs, in lengths
+PAIRS = 24              # of curves that are looked at together
 SHORTEST_PX = 60.0      # of both curves together
 
 
@@ -34,43 +39,65 @@ class Alignment:
 
 
 def align(curves_a: list[np.ndarray], curves_b: list[np.ndarray], weights: list[np.ndarray], F: np.ndarray,
-          best: int = 4) -> list[Alignment]:
+          best: int = 4) -> Iterator[Alignment]:
     """The `best` alignments among all pairs of (N, 2) undistorted curves, best first; F maps A to B. `weights`: how
-    much each curve of A and of B counts. Empty where nothing fits."""
+    much each curve of A and of B counts. None where nothing fits.
+
+    Pairs are looked at in the order of the most that they could score, and no more of them than are asked for.
+    """
     if not curves_a or not curves_b:
-        return []
+        return
     a, length_a = _sampled(curves_a)
     b, length_b = _sampled(curves_b)
-    gains = []
-    for ia in range(len(a)):
-        lines = epipolar_lines(F, a[ia])                                        # in B
-        to_b = np.einsum('ik,njk->nij', lines[:, :2], b) + lines[None, :, 2:]   # (nb, S, S)
-        back = epipolar_lines(F.T, b.reshape(-1, 2)).reshape(len(b), SAMPLES, 3)
-        to_a = np.einsum('njk,ik->nij', back[..., :2], a[ia]) + back[:, None, :, 2]
-        d = np.minimum(_distance_across(to_b, 2), _distance_across(to_a, 1))
-        gains.append(np.maximum(1 - (d / TOLERANCE_PX) ** 2, WORST).astype(np.float32))
-    gain = np.stack(gains)                                                      # (na, nb, S, S)
-    # and B read backwards: (na, nb, 2, S, S)
-    gain = np.stack([gain, gain[..., ::-1]], axis=2)
-    step_a = (length_a / (SAMPLES - 1))[:, None, None, None].astype(np.float32)
-    step_b = (length_b / (SAMPLES - 1))[None, :, None, None].astype(np.float32)
+    # all of both curves matched, the first samples, too
+    most = ((SAMPLES / (SAMPLES - 1))**2.5 * np.sqrt(length_a[:, None] + length_b)
+            * weights[0][:, None] * weights[1])
+    pairs = np.stack(np.unravel_index(np.argsort(-most, axis=None), most.shape), axis=1)
+    found: list[tuple[float, int, Callable[[], Alignment | None]]] = []     # a heap
+    number = count()
+    for k in range(0, len(pairs), PAIRS):
+        ia, ib = pairs[k:k + PAIRS].T
+        for score, made in _scored(a[ia], b[ib], length_a[ia], length_b[ib], weights[0][ia] * weights[1][ib], F,
+                                   pairs[k:k + PAIRS]):
+            heappush(found, (-score, next(number), made))
+        more = pairs[k + PAIRS:k + PAIRS + 1]
+        while found and best and (not len(more) or -found[0][0] >= most[tuple(more[0])]):
+            best -= 1
+            alignment = heappop(found)[2]()
+            if alignment is not None:
+                yield alignment
+        if not best:
+            return
+
+
+def _scored(a: np.ndarray, b: np.ndarray, length_a: np.ndarray, length_b: np.ndarray, weights: np.ndarray,
+            F: np.ndarray, pairs: np.ndarray) -> Iterator[tuple[float, Callable[[], Alignment | None]]]:
+    """The score of each of P `pairs` (P, 2) of (P, SAMPLES, 2) curves, either way round, and what traces its alignment;
+    None where that is too short."""
+    lines, back = (epipolar_lines(M, x.reshape(-1, 2)).reshape(len(x), SAMPLES, 3) for M, x in ((F, a), (F.T, b)))
+    to_b = lines[..., :2] @ b.transpose(0, 2, 1) + lines[..., 2:]                               # (P, S, S)
+    to_a = a @ back[..., :2].transpose(0, 2, 1) + back[:, None, :, 2]
+    d = np.minimum(_distance_across(to_b, 2), _distance_across(to_a, 1))
+    gain = np.maximum(1 - (d / TOLERANCE_PX) ** 2, WORST).astype(np.float32)
+    gain = np.stack([gain, gain[..., ::-1]], axis=1)                    # and B read backwards: (P, 2, S, S)
+    step_a, step_b = ((x / (SAMPLES - 1))[:, None, None].astype(np.float32) for x in (length_a, length_b))
     total = _fill(gain, step_a, step_b)
-    flat = total.reshape(len(a), len(b), 2, -1)
-    matched = flat.max(axis=3)
-    share = matched / (length_a[:, None, None] + length_b[None, :, None])
+    matched = total.reshape(len(a), 2, -1).max(axis=2)
+    share = matched / (length_a + length_b)[:, None]
     # a device is seen whole by both
-    score = np.sqrt(matched) * share**2 * weights[0][:, None, None] * weights[1][None, :, None]
-    found = []
-    for k in np.argsort(-score, axis=None)[:best]:
-        ia, ib, flip = np.unravel_index(k, score.shape)
-        if matched[ia, ib, flip] < SHORTEST_PX:
-            continue
-        i, j = _trace(total[ia, ib, flip], gain[ia, ib, flip], float(length_a[ia]), float(length_b[ib]))
+    score = np.sqrt(matched) * share**2 * weights[:, None]
+
+    def made(p: int, flip: int) -> Alignment | None:
+        if matched[p, flip] < SHORTEST_PX:
+            return None
+        i, j = _trace(total[p, flip], gain[p, flip], float(length_a[p]), float(length_b[p]))
         if min(np.ptp(i), np.ptp(j)) < 5:       # a point of one plane against a line of the other is no curve
-            continue
-        found.append(Alignment(int(ia), int(ib), bool(flip), float(score[ia, ib, flip]),
-                               i * length_a[ia] / (SAMPLES - 1), j * length_b[ib] / (SAMPLES - 1)))
-    return found
+            return None
+        return Alignment(int(pairs[p, 0]), int(pairs[p, 1]), bool(flip), float(score[p, flip]),
+                         i * length_a[p] / (SAMPLES - 1), j * length_b[p] / (SAMPLES - 1))
+
+    for p, flip in np.ndindex(len(a), 2):
+        yield float(score[p, flip]), partial(made, p, flip)
 
 
 def _sampled(curves: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
