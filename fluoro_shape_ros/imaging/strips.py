@@ -17,7 +17,7 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over
                         # TOGETHER strips
 PALER, DARKER = 0.15, 4.0       # times as dark as it usually is, that a part of a device may be
-SURELY = 3.0            # standard deviations
+SURELY = 3.0            # standard deviations by which a strip that is darker than usual is so not by noise
 PALE = 0.4              # times as dark as usual, that the line found in a strip at least is
 FOUND_PX = 0.3          # what `search` is worth
 MARGIN_PX = 4           # of a Sheet: interpolation reaches 2 px
@@ -231,7 +231,7 @@ def measure(strips: Strips, model: Model, reference: np.ndarray | None = None) -
     usual[~(usual > 1e-9)] = np.nan     # no darkness at all, or brighter than its surroundings: no device to measure
     gain = np.sqrt((fit * fit).sum(axis=2))
     # a band is by far darker than the rest: what surely is darker than usual counts as it is
-    dark = np.fmax(usual, darkness - SURELY * noise * gain[:, 3:4])
+    dark = usual * np.fmax((darkness - SURELY * noise * gain[:, 3:4]) / usual, 1.0)
     offset = coefficients[..., 4] / dark
     variance = (noise * gain[:, 4:]) ** 2 / (usual * dark)   # it may be another line's, too
     # A background that is no parabola pulls neighbouring strips the same way: there their errors do not average out.

@@ -148,7 +148,9 @@ class Memory:
         self._lock = threading.Lock()
         self._last: deque[tuple[Shape, int, str]] = deque(maxlen=2)     # shape, stamp, frame
         self._search = None     # one of whole images that was cut short
-        self._searched = None   # what the last one found, as long as that suffices
+        self._searched = None   # what the last one found, as long as that suffices ...
+        # ... and the last pair's config and masks: with others it would find something else
+        self._looked_with: tuple[Config | None, tuple | None] = None, None
         self._sums, self._taken, self._wanted = None, 0, 0
         self._masks, self._window = None, None      # what was captured, and the images it fits
         self.generation = 0     # a result that was begun in an earlier one is out of date
@@ -216,6 +218,9 @@ class Memory:
                      if job.config.curve.tracking and frame_id == frame.frame_id]
             before, previous = [(None, None)] * (2 - len(known)) + known
             points, fault = _predicted(job, frame)
+            if self._looked_with[0] != job.config or self._looked_with[1] is not self._masks:
+                self._searched = None
+            self._looked_with = job.config, self._masks
             return Prior(previous[0], previous[1], before[0], before[1], self._masks, points, fault, self._search,
                          self._searched if known else None)
 

@@ -150,16 +150,34 @@ def test_the_shape_before_the_last_is_remembered_too():
     assert (prior.previous, prior.previous_stamp_ns, prior.before, prior.before_stamp_ns) == (later.shape, 9, SHAPE, 5)
 
 
-def test_what_a_search_found_is_remembered_as_long_as_the_shape_it_led_to():
+def test_what_a_search_found_counts_until_something_changes():
     memory, found = Memory(), Searched(3.0, 0.5)
     the_job = job(generation=memory.generation)
     frame = adapt(the_job, view_of, no_lookup, Tally())
-    memory.remember(the_job, frame, replace(GOOD, searched=found))
+
+    def find(**values):
+        recall(memory, **values)
+        memory.remember(the_job, frame, replace(GOOD, searched=found))
+
+    find()
     assert recall(memory).searched is found
-    assert recall(memory, tracking=False).searched is recall(memory, reference_frame='cell').searched is None
+    assert recall(memory, robot_radius=0.002).searched is None      # another radius shows other things
+    find()
+    memory.capture_mask(1)
+    assert memory.take_for_mask(frame, image_window(the_job, frame))
+    assert recall(memory).searched is None                          # so does a mask
+    find()
+    assert recall(memory).searched is found
+    memory.clear_mask()
+    assert recall(memory).searched is None
+    find(tracking=False)
+    assert recall(memory, tracking=False).searched is None
+    find()
+    assert recall(memory, reference_frame='cell').searched is None
+    find()
     memory.remember(the_job, frame, Reconstruction(Outcome.LOW_CONFIDENCE))
     assert recall(memory).previous is SHAPE and recall(memory).searched is None
-    memory.remember(the_job, frame, replace(GOOD, searched=found))
+    find()
     memory.reset()
     assert recall(memory).searched is None
 
