@@ -21,9 +21,9 @@ def field_of_view(image: np.ndarray, polarity: str = 'dark') -> np.ndarray:
     small = image
     while min(small.shape) >= 2 * SMALLEST_PX or small.size > MOST:     # OpenCV is many times faster at halving
         small = cv2.resize(small, (-(-small.shape[1] // 2), -(-small.shape[0] // 2)), interpolation=cv2.INTER_AREA)
-    small = small.astype(np.float32)
+    small = cv2.normalize(small, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_32F)     # squares of any grey levels fit then
     found = [o for bright in (False, True) if polarity in ('auto', ('dark', 'bright')[bright])
-             for o in outlines(small.max() - small if bright else small)]
+             for o in outlines(255 - small if bright else small)]
     if not found:
         return _open(h, w)
     field, scale = np.full((h, w), 255, np.uint8), (w / small.shape[1], h / small.shape[0])

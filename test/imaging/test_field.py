@@ -108,7 +108,9 @@ def test_dense_anatomy_beside_a_blade_does_not_hide_that(name):
 
 
 @pytest.mark.parametrize('change', [lambda i: i.astype(np.uint16) * 200, lambda i: i.astype(np.float32) / 255,
-                                    lambda i: i.astype(np.float32) - 4])
+                                    lambda i: i.astype(np.float32) - 4,
+                                    lambda i: i.astype(np.float32) * np.float32(1e35)])
+@pytest.mark.filterwarnings('error')
 def test_depth_and_range_of_the_image_do_not_matter(change):
     image = np.where(OPENINGS['an intensifier'], 4, 180).astype(np.uint8)
     assert np.array_equal(field_of_view(change(image)), field_of_view(image))
