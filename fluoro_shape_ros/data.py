@@ -99,14 +99,6 @@ class Centerline:
 
 
 @dataclass(frozen=True)
-class Matches:
-    """Corresponding points of the two planes, ordered along the device; undistorted pixels."""
-
-    a_px: np.ndarray    # (N, 2)
-    b_px: np.ndarray    # (N, 2)
-
-
-@dataclass(frozen=True)
 class Shape:
     """The backbone, base to tip, in the reference frame."""
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..cli import ToolError
 from ..data import Frame
 from ..device import presets
-from ..sim import carm, ct, scenes, xray
+from ..sim import carm, ct, placement, scenes, xray
 from ..sim import variety as wide
 from ..sim.scenes import Run
 from .case import Case, Family
@@ -56,6 +56,8 @@ def varied(sources: Sources = Sources()) -> dict[str, Family]:
         'wide_blank': Family('the same without the rod', lambda seed: _without(_rod_run(seed)), device=False),
         'wide_one_plane': Family('the same with the rod in one plane only', lambda seed: _in_one_plane(_rod_run(seed)),
                                  device=False),
+        'wide_unpaired': Family('the same with another rod in plane B: images of different moments',
+                                lambda seed: _unpaired(_rod_run(seed)), device=False),
         'devices': Family(f'{", ".join(presets())}, in turn, before drawn anatomy',
                           lambda seed: _varied(wide.device_run(seed), kind=True)),
         'gvxr': Family('tubes and rods in tissue, drawn by gVirtualXray at 0.2 mm a pixel',
@@ -88,6 +90,14 @@ def _in_one_plane(run: Run) -> Case:
     images = [scene.frame.images[i] if i == seen else run.without_device(index=1).images[i] for i in (0, 1)]
     return Case(dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, images=tuple(images))),
                 note=f'device in plane {"ab"[seen]} only')
+
+
+def _unpaired(run: Run) -> Case:
+    shape, shaft = placement.place(np.random.default_rng([run.seed, 11]), run.fields, 'spline',
+                                   (run.shape.length / 2, run.shape.length), bool(run.shaft))
+    scene, other = run.scene(), dataclasses.replace(run, shape=shape, shaft=shaft).scene(index=1)
+    return Case(dataclasses.replace(scene, frame=dataclasses.replace(
+        scene.frame, images=(scene.frame.images[0], other.frame.images[1]))), note='another device in plane b')
 
 
 def _volume(file: Path) -> ct.Volume:

@@ -53,9 +53,6 @@ class Score:
         """Stamp of the first pair; None before it."""
         return min(self._truths, default=None)
 
-    def truth_of(self, stamp_ns: int) -> np.ndarray | None:
-        return self._truths.get(stamp_ns)
-
     def unanswered(self, now_ns: int) -> list[int]:
         """Stamps of the pairs that wait for more than PATIENCE_S, or were overtaken by an answered one."""
         newest = max(self._answered, default=0)

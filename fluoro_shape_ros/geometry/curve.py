@@ -59,6 +59,18 @@ def frames(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tangents, normals
 
 
+def arcs(points: np.ndarray, tangents: np.ndarray, curvature: np.ndarray,
+         s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(..., M, 3) points and unit tangents at (M,) m along circular arcs from (..., 3) points.
+
+    tangents: (..., 3) unit, of the arcs there. curvature: (..., 3) 1/m, across these, to where the arcs bend.
+    """
+    k, (p, t, c), s = np.linalg.norm(curvature, axis=-1)[..., None, None], (x[..., None, :] for x in
+                                                                            (points, tangents, curvature)), s[:, None]
+    along, half = s * np.sinc(k * s / np.pi), np.sinc(k * s / (2 * np.pi))      # sin(ks) / k
+    return p + t * along + 0.5 * c * (s * half)**2, t * np.cos(k * s) + c * along
+
+
 def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The median along an axis, of an even number the upper one of the middle two; several times as fast as NumPy's."""
     k = values.shape[axis] // 2

@@ -13,9 +13,10 @@ import numpy as np
 
 from ..geometry.cameras import depth, pixels_per_metre
 from ..geometry.curve import middle
-from ..geometry.spline import Spline3, through
+from ..geometry.spline import Spline3, bending, through
 from ..imaging.strips import Sheet, Strips, cut
 from .fit.fit import MAX_HALF_WIDTH_PX, Fit
+from .fit.solver import BEND_SIGMA
 
 BLOCK = 12              # strips, along which darkness is averaged
 WIDER, BLUR_PX = 1.2, 1.0  # half a line's width is taken as so many times that of the device, and so much more for blur
@@ -27,7 +28,6 @@ TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 PARTS, FEW = 3, 3       # of a device that are looked at apart for its width, of so many blocks at least
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
 FARTHEST = 12.0         # nats, in the same way
-BY_CHANCE = 2.0         # deviations, that the darkest of some places beside the device stands out by
 SKETCHED_PX = 2         # between the strips of a curve that was not fitted
 
 
@@ -44,12 +44,13 @@ class Features:
     narrow: float       # ... and the other way round
     residual: float     # px rms, of the device from the curve
     sigma: float        # ln of the curve's, as a share of what it may be off by
+    uneven: float       # ln of how abruptly it bends at most, beyond what is usual
     tip_stops: float    # how much darker it is before its tip than past it, as a share of its darkness
     tip_shown: float    # darkness of its last BLOCK before the tip, as a share of its darkness
     base_stops: float   # as tip_stops
-    tip_sigma: float    # ln of the tip's along the curve, as a share of what it may be off by
-    tip_aside: float    # darkness of a line beside where it would go on, beyond what places beside it happen to look
-                        # like
+    tip_sigma: float    # ln of the tip's, as a share of what it may be off by
+    base_sigma: float   # ln of the base's along the curve, in the same way
+    tip_aside: float    # darkness of a line beside where it would go on past its tip, that both planes show
     tip_farther: float  # nats by which both planes show it going on past its tip
     no_tip: float       # 1 where it leaves the field at both ends
     length: float       # ln of the share of an image's diagonal
@@ -67,15 +68,32 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
     stops = np.min([p['stops'] for p in seen], axis=0)
     shown = np.min([p['shown'] for p in seen], axis=0)
     stops[fit.open_end], shown[fit.open_end] = 1.0, 1.0
-    tip_sigma = np.log(np.clip(fit.end_sigma[tip] / max(TIP, TIP_PX * step), 0.01, 10.0))
+    sigma = np.array([np.hypot(fit.end_sigma[tip], _across(fit, (fit.start, fit.stop)[tip])), fit.end_sigma[1 - tip]])
+    tip_sigma, base_sigma = np.log(np.clip(sigma / max(TIP, TIP_PX * step), 0.01, 10.0))
     between = (fit.s > fit.start) & (fit.s < fit.stop)
     left = [np.sqrt(np.nanmean(o[between]**2)) if np.isfinite(o[between]).any() else 3.0 for o in fit.offset_px.T]
     return np.array([
         *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
-        stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma,
-        np.clip((fit.aside[tip] - BY_CHANCE * fit.clutter).max(), 0.0, 2.0), min(fit.farther[tip], FARTHEST),
+        _uneven(fit), stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, base_sigma,
+        np.clip(fit.aside[tip].min(), 0.0, 2.0), min(fit.farther[tip], FARTHEST),
         fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
+
+
+def _across(fit: Fit, s: float) -> float:
+    """m, the standard deviation of where a fit runs at an arc length."""
+    basis = fit.spline.bases(np.array([s]), 0)[0][0]
+    return float(np.sqrt(sum(basis @ fit.covariance[k::3, k::3] @ basis for k in range(3))))
+
+
+def _uneven(fit: Fit) -> float:
+    """ln of the largest third derivative of a fit, as a share of BEND_SIGMA; 0 up to that. It is small on arcs, large
+    where a curve leaves one line for another."""
+    spline, n = fit.spline, len(fit.spline.control)
+    piece = (spline.stop - spline.start) / (n - 3)
+    begins = spline.start + piece * np.arange(n - 3)
+    third = np.linalg.norm(bending(n) @ spline.control, axis=1) / piece**3
+    return float(np.log(np.clip(third[(begins + piece > fit.start) & (begins < fit.stop)].max() / BEND_SIGMA, 1, 100)))
 
 
 def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarray:
@@ -165,5 +183,5 @@ def _width(shadow: np.ndarray, x: np.ndarray) -> float:
 
 def _typical(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(W,) median of (N, W) values, and the standard error of that, from their own scatter."""
-    mid = np.median(values, axis=0)
-    return mid, 1.4826 * np.sqrt(np.pi / 2 / len(values)) * np.median(np.abs(values - mid), axis=0)
+    mid = middle(values, axis=0)
+    return mid, 1.4826 * np.sqrt(np.pi / 2 / len(values)) * middle(np.abs(values - mid), axis=0)

@@ -32,6 +32,7 @@ PROMISING = -12.0       # ... and up to which nothing is worth a closer look ...
 CLOSER = 8              # ... at so many more hypotheses
 AS_PROPOSED = 2         # hypotheses that are fitted in the order in which they were proposed; the others in that of
                         # what is seen of them at first sight ...
+BENDS = 3               # arcs on which it may go on past its ends, one after another
 FITTED = 8              # ... as long as there are fewer than so many
 
 
@@ -121,17 +122,23 @@ class Search:
             if self._settled() and not (last is not None and any(h.lines) and h.lines == last):
                 break
             last = h.lines
-            for _ in range(2):
-                if not self._settled():
-                    yield False
-                fitted = fit(self._sheet, h.curve, self._radius, h.coarse, clearing=h.clearing)
-                if fitted is None or not self._may_be(fitted, h):
-                    break
-                final = self._measured(fitted)
-                self.tried.append(Attempt(final, h.lines, *self._judge(final)))
-                if fitted.moved_px <= RESTLESS_PX or self.tried[-1].log_odds < HOPELESS:
-                    break
-                h = Hypothesis(fitted.curve(200), h.lines, clearing=h.clearing)     # it has not come to rest
+            yield from self._bring_to_rest(h)
+
+    def _bring_to_rest(self, h: Hypothesis, bends: int = BENDS) -> Iterator[bool]:
+        """Fit it, once more where that has not come to rest, and where it seems to go on in a bend, that, too."""
+        for _ in range(2):
+            if not self._settled():
+                yield False
+            fitted = fit(self._sheet, h.curve, self._radius, h.coarse, clearing=h.clearing)
+            if fitted is None or not self._may_be(fitted, h):
+                return
+            final = self._measured(fitted)
+            self.tried.append(Attempt(final, h.lines, *self._judge(final)))
+            if fitted.moved_px <= RESTLESS_PX or self.tried[-1].log_odds < HOPELESS:
+                break
+            h = Hypothesis(fitted.curve(200), h.lines, clearing=h.clearing)     # it has not come to rest
+        if bends and fitted is not None and fitted.bent is not None and self.tried[-1].log_odds > HOPELESS:
+            yield from self._bring_to_rest(Hypothesis(fitted.bent, h.lines, 1, h.clearing), bends - 1)
 
     def _may_be(self, f: Fit, h: Hypothesis) -> bool:
         """Whether a fit is long enough, and, where no line but a guess led to it, bears that out."""

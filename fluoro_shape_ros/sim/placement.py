@@ -141,6 +141,10 @@ def _bent(rng: np.random.Generator, length: float, views) -> shapes.Spline:
     return shapes.random_spline(rng, length, rng.uniform(0.5, 2.0) * shapes.MAX_CURVATURE, np.deg2rad(150))
 
 
+def _hooked(rng: np.random.Generator, length: float, views) -> shapes.Cannula:
+    return shapes.random_hook(rng, length)
+
+
 def _looped(rng: np.random.Generator, length: float, views) -> shapes.Spline:
     """A loose turn of a screw, as a catheter loops, with its axis near one of the viewing directions; it bends as tight
     as other shapes do."""
@@ -163,6 +167,7 @@ KINDS: dict[str, tuple[Callable, Callable]] = {
     'spline': (_spline, well_seen),
     'cannula': (_cannula, well_seen),
     'bent': (_bent, well_seen),
+    'hooked': (_hooked, well_seen),
     'tangent': (_spline, turns_back),
     'crossing': (_looped, crosses_itself),
 }

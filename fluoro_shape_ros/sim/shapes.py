@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 STEP = 1e-4             # m, arc-length step of a backbone
 MAX_CURVATURE = 40.0    # 1/m: no bend tighter than a radius of 25 mm
+HOOK_CURVATURE = 160.0  # 1/m: of a hook's end
 KNOT_SPACING = 0.025    # m of arc between the directions a random spline is drawn through
 
 
@@ -127,6 +128,15 @@ def random_cannula(rng: np.random.Generator, length: float, max_curvature: float
     outer_curvature = rng.choice([0.0, rng.uniform(0.1, 0.4) * max_curvature])
     return centred(rng, Cannula(outer, float(outer_curvature), rng.uniform(-np.pi, np.pi), length - outer,
                                 rng.uniform(0.3, 0.9) * max_curvature, rng.uniform(-np.pi, np.pi)))
+
+
+def random_hook(rng: np.random.Generator, length: float) -> Cannula:
+    """A gently bent shaft whose end is bent tightly, as that of a steerable catheter or a J-tipped wire, of `length` m
+    in all, at a random pose about the origin."""
+    end = rng.uniform(0.1, 0.4) * length
+    tight = min(np.deg2rad(rng.uniform(45.0, 170.0)) / end, HOOK_CURVATURE)
+    return centred(rng, Cannula(length - end, rng.uniform(0.0, 0.4) * MAX_CURVATURE, rng.uniform(-np.pi, np.pi), end,
+                                float(tight), rng.uniform(-np.pi, np.pi)))
 
 
 def centred(rng: np.random.Generator, shape, spread: float = 0.005):

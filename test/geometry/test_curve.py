@@ -4,12 +4,27 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length, curvature, distance_to, even_steps, resample
+from fluoro_shape_ros.geometry.curve import (
+    arc_length,
+    arcs,
+    at_arc_length,
+    curvature,
+    distance_to,
+    even_steps,
+    resample,
+)
 
 
 def circle(radius, angle, n):
     t = np.linspace(0, angle, n)
     return np.c_[radius * np.cos(t), radius * np.sin(t), np.zeros(n)]
+
+
+def test_arcs_by_hand():
+    start, x, quarter = np.array([[1.0, 2, 3]] * 2), np.array([[1.0, 0, 0]] * 2), np.pi / 2
+    points, tangents = arcs(start, x, np.array([[0.0, 0.5, 0], [0, 0, 0]]), np.array([0.0, 2 * quarter]))
+    assert_allclose(points, [[[1, 2, 3], [3, 4, 3]], [[1, 2, 3], [1 + 2 * quarter, 2, 3]]], atol=1e-12)
+    assert_allclose(tangents, [[[1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 0, 0]]], atol=1e-12)
 
 
 def test_arc_length_by_hand():

@@ -103,11 +103,13 @@ def test_a_curve_that_runs_the_other_way_says_nearly_the_same():
 
 def test_which_end_is_the_tip_exchanges_what_is_said_of_the_ends():
     sheet, f = known(True)
-    f = replace(f, clutter=np.zeros(2), aside=np.array([[0.1, 0.2], [0.7, 0.3]]), open_end=np.array([False, False]))
+    f = replace(f, aside=np.array([[0.1, 0.2], [0.7, 0.3]]), open_end=np.array([False, False]))
     one, other = named(f, sheet, True), named(f, sheet, False)
-    assert one['tip_aside'] == 0.7 and other['tip_aside'] == 0.2      # of both planes the darker
+    assert one['tip_aside'] == 0.3 and other['tip_aside'] == 0.1      # what only one plane shows is another line
     assert one['tip_stops'] != other['tip_stops']
     assert one['base_stops'] == other['tip_stops'] and other['base_stops'] == one['tip_stops']
+    # of the tip, what lies across counts, too
+    assert one['base_sigma'] < other['tip_sigma'] and other['base_sigma'] < one['tip_sigma']
     assert_same(one, other, 0, [n for n in NAMES if not n.startswith(('tip', 'base'))])
 
 
@@ -154,7 +156,24 @@ def by_hand(points):
     spline = through(points, 0.005)
     s = np.arange(spline.start, spline.stop, PX)
     return replace(f, spline=spline, start=0.0, stop=float(arc_length(points)[-1]), s=s, presence=np.ones((len(s), 2)),
-                   offset_px=np.zeros((len(s), 2)))
+                   offset_px=np.zeros((len(s), 2)), covariance=np.zeros((spline.control.size,) * 2))
+
+
+def test_arcs_are_even_and_what_leaves_one_line_for_another_is_not():
+    sheet, _ = known()
+    t = np.linspace(0, 1.2, 400)
+    arc = 0.05 * np.c_[np.sin(t), np.zeros(len(t)), 1 - np.cos(t)]
+    jogged = arc + np.c_[np.zeros(400), 2e-3 / (1 + np.exp(-(t - 0.6) / 0.02)), np.zeros(400)]      # by 2 mm
+    assert named(by_hand(arc), sheet)['uneven'] == 0 and named(by_hand(jogged), sheet)['uneven'] > 1
+
+
+def test_a_tip_known_badly_across_is_as_uncertain_as_one_known_badly_along():
+    sheet, f = known()
+    n, basis = len(f.spline.control), f.spline.bases(np.array([f.stop]), 0)[0][0]
+    across = replace(f, end_sigma=np.zeros(2), covariance=np.kron(np.eye(n), np.diag([1e-6, 0, 0])) / (basis @ basis))
+    along = replace(f, end_sigma=np.full(2, 1e-3), covariance=np.zeros((3 * n, 3 * n)))
+    assert_allclose([named(x, sheet)['tip_sigma'] for x in (across, along)], 0, atol=1e-9)     # 1 mm each
+    assert named(across, sheet)['base_sigma'] < named(along, sheet)['base_sigma'] == 0
 
 
 def test_what_the_fit_left_over_is_its_rms_in_the_worse_plane():

@@ -118,9 +118,10 @@ def photographed(points, lines=()):
     return Frame(0, 'isocenter', tuple(images), VIEWS)
 
 
-def bent(turn_deg):
-    """(N, 3) m, a step each: 40 mm straight, turned by `turn_deg` over 6 mm, 20 mm straight."""
-    heading = np.deg2rad(turn_deg) * np.clip((np.arange(660) * STEP - 0.04) / 0.006, 0, 1)
+def bent(turn_deg, over=0.006, after=0.02):
+    """(N, 3) m, a step each: 40 mm straight, turned by `turn_deg` over `over` m, `after` m straight."""
+    s = np.arange(round((0.04 + over + after) / STEP)) * STEP
+    heading = np.deg2rad(turn_deg) * np.clip((s - 0.04) / over, 0, 1)
     across = np.array([0.6, 0.8, 0.0])
     steps = np.cos(heading)[:, None] * np.array([0.0, 0.2, 0.98]) + np.sin(heading)[:, None] * across
     return np.array([-0.01, -0.01, -0.03]) + np.cumsum(STEP * steps, axis=0)
@@ -130,8 +131,33 @@ def bent(turn_deg):
 def test_a_device_that_turns_aside_where_the_start_ends_is_followed(turn_deg, start):
     truth = bent(turn_deg)
     f = fitted(photographed(truth), truth[:start])
+    for _ in range(3):
+        f = f if f.bent is None else fitted(photographed(truth), f.bent)
     assert_allclose(ends(f), truth[[0, -1]], atol=0.3e-3)
     assert off(f, truth).mean() < 0.1e-3
+
+
+def test_a_hook_is_followed_arc_by_arc():
+    truth = bent(150, over=0.018, after=0.001)
+    frame, f = photographed(truth), None
+    f = fitted(frame, truth[:380])
+    assert f.bent is not None and np.linalg.norm(nearest(f.bent, truth), axis=1).max() < 0.6e-3
+    lengths = [f.stop - f.start]
+    while f.bent is not None and len(lengths) < 5:
+        f = fitted(frame, f.bent)
+        lengths.append(f.stop - f.start)
+    assert f.bent is None and (np.diff(lengths) > 0).all()
+    assert_allclose(ends(f), truth[[0, -1]], atol=0.3e-3)
+    assert off(f, truth).mean() < 0.1e-3
+
+
+@pytest.mark.parametrize('shown_in', [(True, False), (False, True)])
+def test_what_one_plane_alone_shows_beside_an_end_is_no_bend(shown_in):
+    truth = bent(0, after=0.0)
+    hooked = bent(150, over=0.018, after=0.001)
+    f = fitted(photographed(truth, [(hooked[len(truth) + 10:], shown_in)]), truth)
+    assert f.bent is None
+    assert_allclose(ends(f), truth[[0, -1]], atol=0.4e-3)
 
 
 def hidden_in_one(slant, plane, turn_deg=20):

@@ -98,7 +98,7 @@ def test_in_a_fit_it_counts_by_its_standard_deviation_and_only_across_the_curve(
     covariance = np.zeros((n, 3, n, 3))
     covariance[:, 1, :, 1] = (5 * mm) ** 2
     covariance[np.arange(n), 2, np.arange(n), 2] = (0.01 * mm) ** 2
-    f = Fit(Spline3(0.0, 0.1, control), 0.0, 0.1, *[None] * 2, covariance.reshape(3 * n, 3 * n), *[None] * 10)
+    f = Fit(Spline3(0.0, 0.1, control), 0.0, 0.1, *[None] * 2, covariance.reshape(3 * n, 3 * n), *[None] * 9)
     told = prior.informed(f, prior.Guess(LINE + [0.3 * mm, 2 * mm, 2 * mm], np.full(len(LINE), 5 * mm)))
     points = told.spline(np.linspace(0, 0.1, 21))
     assert_allclose(points[:, 0], np.linspace(-0.05, 0.05, 21), atol=1e-6)      # it does not slide along itself

@@ -305,6 +305,15 @@ def test_a_fit_that_still_moves_is_fitted_once_more(chosen, sheet, monkeypatch):
     assert at_rest(sheet, moving, RADIUS, clearing=True) is chosen.fit and again == [(0, dict(clearing=True))]
 
 
+def test_where_it_may_go_on_in_a_bend_both_are_tried_and_bends_come_to_an_end(chosen, scene, sheet, monkeypatch):
+    bend, given = scene.truth + [0, 0, 1e-4], []
+    counted(monkeypatch, [Hypothesis(scene.truth, lines(scene.truth))])
+    monkeypatch.setattr(search, 'fit', lambda sheet, points, *_, **__: given.append(points)
+                                                                       or replace(chosen.fit, bent=bend))
+    tried, _ = searched(sheet, settles=never)
+    assert [g is bend for g in given] == [False] + [True] * search.BENDS and len(tried) == len(given)
+
+
 # ---- on images
 
 

@@ -67,6 +67,18 @@ def test_nothing_bends_tighter_than_allowed_even_while_moving(shape):
     assert max(tightest) > 0.2 * shapes.MAX_CURVATURE       # but it does bend
 
 
+def test_a_hook_is_bent_by_its_end_and_never_too_tightly():
+    for seed in range(20):
+        hook = shapes.random_hook(np.random.default_rng(seed), 0.1)
+        points = hook.backbone(5e-4)
+        along = np.linspace(0, hook.length, len(points))[1:-1]
+        inner = along - hook.outer_length
+        shaft, end = (curvature(points)[m] for m in (inner < -1e-3, inner > 1e-3))
+        assert shaft.max() < end.min() and end.max() < shapes.HOOK_CURVATURE * 1.001
+        turned = np.degrees(hook.inner_curvature * hook.inner_length)
+        assert 45 <= turned <= 170 or hook.inner_curvature == shapes.HOOK_CURVATURE
+
+
 @pytest.mark.parametrize('shape', RANDOM)
 def test_motion_starts_as_drawn_stands_at_its_base_and_is_slow(shape):
     still = shape.backbone()

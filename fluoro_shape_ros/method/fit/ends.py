@@ -20,6 +20,7 @@ ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more i
 BAND, SOFT_TIP = 3e-3, 2e-3     # m: longest marker band, and farthest that a device goes on past one at its end
 SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing
                                 # is seen, since it may be pale
+GOES_ON = 3.0           # nats past an end, that make one look farther
 REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess

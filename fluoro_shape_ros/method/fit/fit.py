@@ -30,7 +30,8 @@ from ...imaging.strips import (
     measure,
     search,
 )
-from .ends import BLURS_PX, BRIDGED_PX, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
+from .bends import GROWTH_PX, bent_on
+from .ends import BLURS_PX, BRIDGED_PX, GOES_ON, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
 from .neighbours import without_neighbours
 from .solver import EndRow, Layout, Solution, solve
 
@@ -44,7 +45,7 @@ WIDE_PX = 8.0           # extra reach of the strips while the start is still rou
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked at once
 NEAR_END_PX = 8
 ASTRAY = 0.04           # px a px, that it may bend away past an end
-GROWTH, GROWTH_PX = 8, 30   # how often the curve may be prolonged, and by how much
+GROWTH = 8              # how often the curve may be prolonged
 # strips around an end, and how far from the first guess it is looked for
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the
@@ -53,9 +54,7 @@ SURPRISE = 60.0         # squared difference of the planes' ends that the curve'
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far
                                 # past its ends
-GOES_ON_BOTH = 3.0      # nats of evidence past an end that make one look farther ...
-GOES_ON_ALONE = 0.6     # ... or darkness there in one plane alone, as a share of the usual ...
-GOES_ON_ASIDE = 0.8     # ... or of a line beside where it would go on, in either
+GOES_ON_ALONE = 0.6     # darkness past an end in one plane alone, as a share of the usual, that makes one look farther
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another
                                 # line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
@@ -81,7 +80,6 @@ class Fit:
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share
                                 # of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
-    clutter: np.ndarray         # (2,) how dark places beside it happen to look, as a share of its darkness
     farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, see `_Pair.farther`
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the
                                 # other; -1: both tell
@@ -90,6 +88,8 @@ class Fit:
     seen_at: np.ndarray | None = None       # (2, 2) m, where the first and the last end (rows) are by plane A, B alone;
                                             # NaN where one does not tell well
     seen_sigma: np.ndarray | None = None    # (2, 2) m
+    bent: np.ndarray | None = None          # (N, 3) m, the curve going on in a bend past an end, where both planes show
+                                            # something there
 
     def curve(self, count: int) -> np.ndarray:
         """(count, 3) m along the device."""
@@ -113,7 +113,8 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
     seen = pair.settle(through(points, beyond_px * step), (0.0, arc_length(points)[-1]), coarse, FINE)
     if seen is None:
         return None
-    seen, aside, farther = pair.grow(seen)
+    seen, farther = pair.grow(seen)
+    aside = pair.aside(seen)
     s, look = seen.layout.s, partial(pair.look, seen.model)
     found, ends = _finish(seen, aside, farther, half_width, radius)
     agreed = _agree(found, ends, views)
@@ -125,7 +126,7 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
                               half_width, radius)
         slid = np.linalg.norm(found.curve(2) - before, axis=1).max() / step      # in depth, which strips do not see
         found = replace(found, moved_px=max(found.moved_px, float(slid)))
-    return _see_ends(look, found, ends, half_width, radius, seen.clutter)
+    return replace(_see_ends(look, found, ends, half_width, radius, seen.clutter), bent=pair.bent(seen, aside))
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,11 @@ class _Seen:
         """(2, 2) darkness past the first and the last end (rows) in each plane, see _beyond."""
         presence = self.measured.presence.T
         return np.stack([_beyond(presence, self.stretch[0], -1), _beyond(presence, self.stretch[1], 1)])
+
+    @property
+    def known_beyond(self) -> np.ndarray:
+        """(2,) bool: whether both planes' fields reach past the first and the last end."""
+        return ~np.isnan(self.beyond).any(axis=1)
 
 
 @dataclass(frozen=True)
@@ -230,31 +236,25 @@ class _Pair:
                      2 * self.reach + WIDE_PX, rough=True)
         return clutter(strips, self.narrow, self.reach, SMOOTH_PX // COARSE_STEP)
 
-    def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray, np.ndarray]:
-        """The curve prolonged as long as that finds more of the device, straight on or beside it; (2, 2) what then is
-        aside, see `aside`, and (2,) what says that it goes on still, see `farther`."""
+    def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
+        """The curve prolonged as long as that finds more of the device as it runs; (2,) what says that it goes on
+        still, see `farther`."""
         coarse = int(self.cleared is None)     # a search would find the line beside the device again
         for _ in range(GROWTH):
-            beyond, aside = seen.beyond, None
-            known = ~np.isnan(beyond).any(axis=1)
             farther, nats = self.farther(seen)
-            goes_on = known & ((nats > GOES_ON_BOTH) | (beyond > GOES_ON_ALONE).any(axis=1))
+            goes_on = seen.known_beyond & ((nats > GOES_ON) | (seen.beyond > GOES_ON_ALONE).any(axis=1))
             if not goes_on.any():
-                aside = self.aside(seen)
-                goes_on = known & (aside > GOES_ON_ASIDE).any(axis=1)
-                if not goes_on.any():
-                    return seen, aside, nats
-            by = max(GROWTH_PX, farther[nats > GOES_ON_BOTH].max(initial=0) + NEAR_END_PX) * self.step
+                return seen, nats
+            by = max(GROWTH_PX, farther[nats > GOES_ON].max(initial=0) + NEAR_END_PX) * self.step
             (start, stop), (spline, shift) = seen.reference, prolong(seen.solution.spline, goes_on, by)
             longer = self.settle(spline, (start + shift - goes_on[0] * by, stop + shift + goes_on[1] * by), coarse,
                                  FINE - 1, near=True)
-            more = longer is not None and np.diff(longer.reference) - (stop - start) > NEAR_END_PX * self.step
-            if not more and aside is not None:
-                return seen, aside, nats        # that line is another one
-            seen = seen if longer is None else longer
-            if not more:
+            if longer is None or np.ptp(longer.reference) < stop - start:
                 break
-        return seen, self.aside(seen), self.farther(seen)[1]
+            seen = longer
+            if np.ptp(longer.reference) - (stop - start) < NEAR_END_PX * self.step:
+                break
+        return seen, self.farther(seen)[1]
 
     def farther(self, seen: _Seen) -> tuple[np.ndarray, np.ndarray]:
         """(2,) px by which the device may go on past the first and the last end, straight on, perhaps beyond a gap; and
@@ -282,6 +282,14 @@ class _Pair:
         strips = cut(self.sheet, *seen.solution.spline.lines(s), self.reach + WIDE_PX, rough=True).halves()
         line = search(strips, self.template.repeat(2, axis=0))
         return middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
+
+    def bent(self, seen: _Seen, aside: np.ndarray) -> np.ndarray | None:
+        """(N, 3) m, see `Fit.bent`."""
+        maybe = aside.mean(axis=1) > CROWDED
+        if not maybe.any():
+            return None
+        return bent_on(self.sheet, seen.solution.spline, seen.reference, self.step, self.narrow,
+                       middle(seen.measured.usual), seen.clutter, maybe & seen.known_beyond)
 
     def cut(self, points: np.ndarray, tangents: np.ndarray) -> Strips:
         """Strips across the projections of (N, 3) points with (N, 3) tangents."""
@@ -359,8 +367,7 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
     return Fit(solution.spline, start, stop, np.zeros(2), open_end, solution.covariance(), s, presence,
                solution.offset_px.T,
                across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
-               np.nan_to_num(found.clutter / middle(seen.usual), nan=1.0), np.where(open_end, 0.0, farther),
-               np.full(2, -1), solution.moved_px), ends
+               np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
 
 
 def _noise(seen: Measurement, clutter: np.ndarray) -> np.ndarray:

@@ -90,11 +90,13 @@ def sweep(line_px: np.ndarray, views: tuple[View, View], dark: tuple[np.ndarray,
     x = (sources[0] + depths[:, None] * rays[:, None]) @ other.P[:, :3].T + other.P[:, 3]       # (n, K, 3)
     behind = x[..., 2] <= 0
     seen = np.where(behind, 0, _sample(dark[1], other, x[..., :2] / np.where(behind, 1, x[..., 2])[..., None]))
-    ratio = np.log(np.maximum(seen, 1e-6) / own[:, None])
-    ratio = ratio[:, None] - _expected(rays, middle + step * np.arange(-SLOPES, SLOPES + 1), *sources)[..., None]
-    # (n, V, K)
-    gain = np.maximum(1 - (ratio / np.where(ratio < 0, FAINT, DARK)) ** 2, np.where(ratio < 0, FAINTER, DARKER))
-    columns, first, score = most_probable(gain.astype(np.float32))
+    ratio = np.log(np.maximum(seen, 1e-6) / own[:, None]).astype(np.float32)
+    expected = _expected(rays, middle + step * np.arange(-SLOPES, SLOPES + 1), *sources).astype(np.float32)
+    gain = ratio[:, None] - expected[..., None]     # (n, V, K)
+    np.clip(gain, -FAINT * np.sqrt(1 - FAINTER), DARK * np.sqrt(1 - DARKER), out=gain)
+    gain /= np.where(gain < 0, np.float32(FAINT), np.float32(DARK))
+    np.subtract(1, np.square(gain, out=gain), out=gain)
+    columns, first, score = most_probable(gain)
     if len(columns) < SHORTEST:
         return None
     along = gaussian_filter1d(depths[columns], 1.5, mode='nearest')
