@@ -77,6 +77,13 @@ def test_two_lines_that_cross_are_each_followed_straight_on():
     assert any(joins(c, p, q) for c in found) and any(joins(c, r, s) for c in found)
 
 
+def test_a_band_of_metal_does_not_hide_a_pale_line():
+    p, q = (30, 60.3), (210, 60.3)
+    band = 100 * np.exp(-0.5 * (segment((120, 140), (126, 140)) / SIGMA) ** 2)
+    pale = 100 + (draw(segment(p, q), noise=0.4) - 100) * 0.025       # half a grey level deep
+    assert joins(chains(pale)[0], p, q) and joins(chains((pale - band).astype(np.float32))[0], p, q)
+
+
 def test_a_gap_is_bridged_and_marked():
     line, = chains(draw(segment((20, 100), (100, 100)), segment((120, 100), (220, 100))))
     assert joins(line, (20, 100), (220, 100))
