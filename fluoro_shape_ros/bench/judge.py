@@ -29,8 +29,8 @@ from .families import Sources, families, varied
 
 # shares of the scenes
 FAMILIES = {'wide': 12, 'wide_anatomy': 13, 'devices': 12, 'ct': 8, 'wide_blank': 3, 'wide_one_plane': 3,
-            'wide_unpaired': 4, 'ct_none': 2, 'anatomy': 1, 'clutter': 2, 'tangent': 1, 'crossing': 1, 'occlusion': 0.5,
-            'entering': 0.5, 'p_xray': 0.5, 'masked': 0.5, 'angles': 0.5}
+            'wide_unpaired': 1, 'ct_none': 2, 'blank': 3, 'one_plane': 1.5, 'anatomy': 1, 'clutter': 2, 'tangent': 1,
+            'crossing': 1, 'occlusion': 0.5, 'entering': 0.5, 'p_xray': 0.5, 'masked': 0.5, 'angles': 0.5}
 FIRST_SEED = 20000
 RIDGE = 1e-4        # weight of the squared coefficients beside the mean loss: a feature that tells nothing gets none
 FOLDS = 5

@@ -50,7 +50,8 @@ class Features:
     base_stops: float   # as tip_stops
     tip_sigma: float    # ln of the tip's, as a share of what it may be off by
     base_sigma: float   # ln of the base's along the curve, in the same way
-    tip_aside: float    # darkness of a line beside where it would go on past its tip, that both planes show
+    tip_aside: float    # darkness of a line beside where it would go on past its tip, as far as both planes show it:
+                        # geometric mean
     tip_farther: float  # nats by which both planes show it going on past its tip
     no_tip: float       # 1 where it leaves the field at both ends
     length: float       # ln of the share of an image's diagonal
@@ -76,7 +77,7 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
         *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
         _uneven(fit), stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, base_sigma,
-        np.clip(fit.aside[tip].min(), 0.0, 2.0), min(fit.farther[tip], FARTHEST),
+        np.sqrt(np.clip(fit.aside[tip], 0.0, 2.0).prod()), min(fit.farther[tip], FARTHEST),
         fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
 
 

@@ -105,7 +105,9 @@ def test_which_end_is_the_tip_exchanges_what_is_said_of_the_ends():
     sheet, f = known(True)
     f = replace(f, aside=np.array([[0.1, 0.2], [0.7, 0.3]]), open_end=np.array([False, False]))
     one, other = named(f, sheet, True), named(f, sheet, False)
-    assert one['tip_aside'] == 0.3 and other['tip_aside'] == 0.1      # what only one plane shows is another line
+    assert_allclose([one['tip_aside']**2, other['tip_aside']**2], [0.7 * 0.3, 0.1 * 0.2])
+    alone = replace(f, aside=np.array([[0.0, 1.0], [1.0, 0.0]]))    # what only one plane shows is another line
+    assert named(alone, sheet, True)['tip_aside'] == named(alone, sheet, False)['tip_aside'] == 0
     assert one['tip_stops'] != other['tip_stops']
     assert one['base_stops'] == other['tip_stops'] and other['base_stops'] == one['tip_stops']
     # of the tip, what lies across counts, too
