@@ -135,7 +135,12 @@ def cut(sheet: Sheet, points: np.ndarray, tangents: np.ndarray, reach_px: float,
 
     rough: interpolated linearly, several times as fast; for what is looked for to a pixel.
     """
-    centers, normals, speed = lay_out(sheet.views, points, tangents)
+    return cut_at(sheet, *lay_out(sheet.views, points, tangents), reach_px, rough)
+
+
+def cut_at(sheet: Sheet, centers: np.ndarray, normals: np.ndarray, speed: np.ndarray, reach_px: float,
+           rough: bool = False) -> Strips:
+    """Strips as `lay_out` has them."""
     offsets = np.arange(-reach_px, reach_px + 1)
     u, v = sheet.places(centers, normals, offsets)
     ends = [0, len(offsets) // 2, -1]

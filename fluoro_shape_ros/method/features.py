@@ -14,7 +14,7 @@ import numpy as np
 from ..geometry.cameras import depth, pixels_per_metre
 from ..geometry.curve import middle
 from ..geometry.spline import Spline3, bending, through
-from ..imaging.strips import Sheet, Strips, cut
+from ..imaging.strips import Sheet, Strips, cut_at, lay_out
 from .fit.fit import MAX_HALF_WIDTH_PX, Fit
 from .fit.solver import BEND_SIGMA
 
@@ -121,8 +121,22 @@ def _seen(spline: Spline3, start: float, stop: float, step: float, sheet: Sheet,
     points, tangents = spline.lines(s)
     expected = [radius * pixels_per_metre(v.P, points[PAST:-PAST]) for v in sheet.views]
     half = [WIDER * (h + BLUR_PX) for h in expected]
-    strips = cut(sheet, points, tangents, float(np.ceil(5.5 * max(half) + 10)), rough=True)
+    centers, normals, speed = lay_out(sheet.views, points, tangents)
+    _go_straight_on(centers, normals)
+    strips = cut_at(sheet, centers, normals, speed, float(np.ceil(5.5 * max(half) + 10)), rough=True)
     return [_plane(strips, v, half[v], expected[v], count, block) for v in (0, 1)], count
+
+
+def _go_straight_on(centers: np.ndarray, normals: np.ndarray) -> None:
+    """Lay the PAST strips beyond each end, (2, N, 2), along the line that each image shows before it: in space a curve
+    may go on along a plane's rays, where that plane shows nothing of it."""
+    for center, normal in zip(centers, normals):
+        for c, n, way in ((center, normal, 1), (center[::-1], normal[::-1], -1)):       # from its first end, its last
+            line = c[PAST:-PAST]
+            before = line[min(int(np.searchsorted(np.hypot(*(line - line[0]).T), BLOCK)), len(line) - 1)]
+            along = (line[0] - before) / max(float(np.hypot(*(line[0] - before))), 1e-9)
+            c[:PAST] = line[0] + np.arange(PAST, 0, -1)[:, None] * along
+            n[:PAST] = way * along[1], -way * along[0]
 
 
 def _diagonal_px(sheet: Sheet) -> float:
