@@ -260,15 +260,19 @@ def darkness_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
                          borderType=cv2.BORDER_REPLICATE)
 
 
+def depth_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
+    """The same as the depth in image values of a line with this shadow of unit depth."""
+    centred = shadow - shadow.mean()
+    return darkness_across(profiles, shadow) / (centred @ centred)
+
+
 def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int) -> np.ndarray:
     """(V,) how dark places farther than `beside_px` from the middle of the strips happen to look, in image values: the
     standard deviation, from the median (which few lines there do not move), of what a line with the (V, w) `shadows` of
     unit depth seems to be there, averaged over `along` strips."""
     spread = np.empty(len(shadows))
     for v, (profiles, shape) in enumerate(zip(strips.profiles, shadows)):
-        centred = shape - shape.mean()
-        dark = (cv2.blur(darkness_across(profiles, shape), (1, along))[min(along // 2, len(profiles) - 1)::along]
-                / (centred @ centred))
+        dark = cv2.blur(depth_across(profiles, shape), (1, along))[min(along // 2, len(profiles) - 1)::along]
         x, half = strips.offsets_px, len(shape) // 2
         beside = dark[:, (np.abs(x) > beside_px) & (np.abs(x) < x[-1] - half)]
         spread[v] = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...geometry.curve import arcs
 from ...geometry.spline import Spline3
-from ...imaging.strips import Sheet, cut, darkness_across
+from ...imaging.strips import Sheet, cut, depth_across
 from .ends import ABSENT, GOES_ON, SMOOTH_PX, SURE, evidence
 
 STEP_PX, GROWTH_PX = 3, 30  # between places on an arc, and how far a curve is prolonged at once
@@ -64,6 +64,5 @@ def _darkness(sheet: Sheet, points: np.ndarray, tangents: np.ndarray, shadows: n
     field."""
     strips = cut(sheet, points, tangents, shadows.shape[1] // 2 + 1, rough=True)
     near = np.abs(strips.offsets_px) <= 1
-    dark = [darkness_across(p, t)[:, near].max(axis=1) / ((t - t.mean()) @ (t - t.mean()))
-            for p, t in zip(strips.profiles, shadows)]
+    dark = [depth_across(p, t)[:, near].max(axis=1) for p, t in zip(strips.profiles, shadows)]
     return np.where(strips.inside, dark, np.nan)

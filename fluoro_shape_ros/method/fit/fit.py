@@ -25,7 +25,7 @@ from ...imaging.strips import (
     Strips,
     clutter,
     cut,
-    darkness_across,
+    depth_across,
     half_width_range,
     measure,
     search,
@@ -58,7 +58,7 @@ GOES_ON_ALONE = 0.6     # darkness past an end in one plane alone, as a share of
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another
                                 # line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
-CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
+CROWDED = 0.4           # darkness aside: in both planes, that makes an end hard to see; on average, that may be a bend
 HARD_PX = 1.0           # what an end is worth that only one plane shows, or that is hard to see in both
 
 
@@ -266,8 +266,8 @@ class _Pair:
         for k in (0, 1):
             mine = slice(k * len(px), (k + 1) * len(px))
             straight = np.abs(strips.offsets_px) <= 1 + px[:, None] * ASTRAY     # it need not go on quite straight
-            dark = [np.where(straight, darkness_across(p[mine], t) / ((t - t.mean()) @ (t - t.mean())),
-                             -np.inf).max(axis=1) for p, t in zip(strips.profiles, self.narrow)]
+            dark = [np.where(straight, depth_across(p[mine], t), -np.inf).max(axis=1)
+                    for p, t in zip(strips.profiles, self.narrow)]
             total = np.cumsum(evidence(np.where(strips.inside[:, mine], dark, np.nan) / usual,
                                        seen.clutter[:, None] / usual, COARSE_STEP))
             best = int(total.argmax())
