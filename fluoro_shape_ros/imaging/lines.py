@@ -25,12 +25,12 @@ class Candidate:
     score: float            # how much of a device it looks like: strength times length
 
 
-def find_candidates(ridges: Ridges, min_length_px: float, count: int = 8) -> list[Candidate]:
-    """The `count` best chains of an image, best first."""
+def find_candidates(ridges: Ridges, min_length_px: float, count: int = 8, gap_px: float = GAP_PX) -> list[Candidate]:
+    """The `count` best chains of an image, best first. gap_px: the longest gap that is bridged."""
     start, stop, strength = _strong_branches(ridges)
     if not len(start):
         return []
-    chains = _follow(_link_ends(ridges, start, stop, strength), len(start))
+    chains = _follow(_link_ends(ridges, start, stop, strength, gap_px), len(start))
     total = strength * (stop - start)
     chains.sort(key=lambda chain: -sum(total[entry // 2] for entry in chain))
     return _joined(ridges, start, stop, chains, min_length_px, count)
@@ -49,7 +49,8 @@ def _strong_branches(ridges: Ridges) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return ridges.start[good], ridges.start[good + 1], mean[good]
 
 
-def _link_ends(ridges: Ridges, start: np.ndarray, stop: np.ndarray, strength: np.ndarray) -> np.ndarray:
+def _link_ends(ridges: Ridges, start: np.ndarray, stop: np.ndarray, strength: np.ndarray,
+               gap_px: float) -> np.ndarray:
     """(2 B,) for each branch end (2 b: first, 2 b + 1: last) the end it continues in, or -1: best continuations first,
     each end once."""
     step_px = ridges.step_px
@@ -60,7 +61,7 @@ def _link_ends(ridges: Ridges, start: np.ndarray, stop: np.ndarray, strength: np
     strength = np.repeat(strength, 2)
     gap = ends - ends[:, None]                                              # from the first index to the second
     d = np.hypot(gap[..., 0], gap[..., 1])
-    i, j = np.nonzero(np.triu(d < GAP_PX, 1))
+    i, j = np.nonzero(np.triu(d < gap_px, 1))
     i, j = (x[i // 2 != j // 2] for x in (i, j))
     gap, d = gap[i, j], d[i, j]
     slack = 1.5 * step_px / np.maximum(d, 1.5 * step_px)                    # direction of a short gap is uncertain
@@ -69,8 +70,8 @@ def _link_ends(ridges: Ridges, start: np.ndarray, stop: np.ndarray, strength: np
                                for a, b in ((along, out[i]), (-along, out[j]), (-out[i], out[j])))
     turn = np.maximum(between, np.maximum(turn_i, turn_j) - np.arcsin(slack))
     ratio = np.abs(np.log(strength[i] / strength[j]))
-    cost = d / GAP_PX + (turn / MAX_TURN) ** 2 + 0.5 * ratio
-    allowed = np.nonzero((turn <= MAX_TURN * (1 - 0.6 * d / GAP_PX)) & (ratio <= 1.5))[0]
+    cost = d / gap_px + (turn / MAX_TURN) ** 2 + 0.5 * ratio
+    allowed = np.nonzero((turn <= MAX_TURN * (1 - 0.6 * d / gap_px)) & (ratio <= 1.5))[0]
     partner = np.full(len(ends), -1)
     for k in allowed[np.argsort(cost[allowed], kind='stable')]:
         if partner[i[k]] < 0 and partner[j[k]] < 0:

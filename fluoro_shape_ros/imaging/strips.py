@@ -266,17 +266,28 @@ def depth_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
     return darkness_across(profiles, shadow) / (centred @ centred)
 
 
-def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int) -> np.ndarray:
-    """(V,) how dark places farther than `beside_px` from the middle of the strips happen to look, in image values: the
-    standard deviation, from the median (which few lines there do not move), of what a line with the (V, w) `shadows` of
-    unit depth seems to be there, averaged over `along` strips."""
-    spread = np.empty(len(shadows))
+def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int, around: int) -> np.ndarray:
+    """(V, N) how dark places farther than `beside_px` from the middle of the strips happen to look around each strip,
+    in image values: the spread (see `local_spread`) of what a line with the (V, w) `shadows` of unit depth seems to be
+    there, averaged over `along` strips; those of `around` strips count."""
+    at = np.arange(min(along // 2, len(strips.centers_px[0]) - 1), len(strips.centers_px[0]), along)
+    spread = np.empty(strips.inside.shape)
     for v, (profiles, shape) in enumerate(zip(strips.profiles, shadows)):
-        dark = cv2.blur(depth_across(profiles, shape), (1, along))[min(along // 2, len(profiles) - 1)::along]
+        dark = cv2.blur(depth_across(profiles, shape), (1, along))[at]
         x, half = strips.offsets_px, len(shape) // 2
         beside = dark[:, (np.abs(x) > beside_px) & (np.abs(x) < x[-1] - half)]
-        spread[v] = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12
+        spread[v] = np.interp(np.arange(spread.shape[1]), at, local_spread(beside, around // along))
     return spread
+
+
+def local_spread(values: np.ndarray, rows: int) -> np.ndarray:
+    """(N,) standard deviation of (N, W) values around each row, from the median of blocks of so many rows (which few
+    lines there do not move), interpolated between them."""
+    rows = min(max(rows, 1), len(values))
+    first, count = len(values) % rows // 2, len(values) // rows     # the same from either end
+    blocks = values[first:first + count * rows].reshape(count, -1)
+    spread = 1.4826 * middle(np.abs(blocks - middle(blocks)[:, None])) + 1e-12
+    return np.interp(np.arange(len(values)), first + (np.arange(count) + 0.5) * rows - 0.5, spread)
 
 
 def search(strips: Strips, shadows: np.ndarray, smooth: int = 9) -> Measurement:

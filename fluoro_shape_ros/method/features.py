@@ -14,12 +14,13 @@ import numpy as np
 from ..geometry.cameras import depth, pixels_per_metre
 from ..geometry.curve import middle
 from ..geometry.spline import Spline3, bending, through
-from ..imaging.strips import Sheet, Strips, cut_at, lay_out
+from ..imaging.strips import Sheet, Strips, cut_at, lay_out, local_spread
 from .fit.fit import MAX_HALF_WIDTH_PX, Fit
 from .fit.solver import BEND_SIGMA
 
 BLOCK = 12              # strips, along which darkness is averaged
 WIDER, BLUR_PX = 1.2, 1.0  # half a line's width is taken as so many times that of the device, and so much more for blur
+AROUND = 8              # blocks, whose surroundings tell the noise
 PAST = 18               # strips looked at past either end
 CLEAR = 2.5             # signal to noise, at which a block is darker than nearly all places beside the curve
 MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose closest-point mean is within the larger
@@ -27,7 +28,7 @@ MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose
 TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 PARTS, FEW = 3, 3       # of a device that are looked at apart for its width, of so many blocks at least
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
-FARTHEST = 12.0         # nats, in the same way
+FARTHEST = 50.0         # nats, that some 50 px of a device say that is seen beyond doubt
 SKETCHED_PX = 2         # between the strips of a curve that was not fitted
 
 
@@ -52,7 +53,7 @@ class Features:
     base_sigma: float   # ln of the base's along the curve, in the same way
     tip_aside: float    # darkness of a line beside where it would go on past its tip, as far as both planes show it:
                         # geometric mean
-    tip_farther: float  # nats by which both planes show it going on past its tip
+    tip_farther: float  # nats by which both planes show it going on past its tip, as a share of FARTHEST
     no_tip: float       # 1 where it leaves the field at both ends
     length: float       # ln of the share of an image's diagonal
     hidden: float       # ends that only one plane shows
@@ -77,7 +78,7 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
         *_everywhere(seen), min(max(left), 3.0),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
         _uneven(fit), stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, base_sigma,
-        np.sqrt(np.clip(fit.aside[tip], 0.0, 2.0).prod()), min(fit.farther[tip], FARTHEST),
+        np.sqrt(np.clip(fit.aside[tip], 0.0, 2.0).prod()), min(fit.farther[tip] / FARTHEST, 1.0),
         fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
 
 
@@ -88,13 +89,16 @@ def _across(fit: Fit, s: float) -> float:
 
 
 def _uneven(fit: Fit) -> float:
-    """ln of the largest third derivative of a fit, as a share of BEND_SIGMA; 0 up to that. It is small on arcs, large
-    where a curve leaves one line for another."""
+    """ln of the largest third derivative of a fit, beyond what its errors explain, as a share of BEND_SIGMA; 0 up to
+    that. It is small on arcs, large where a curve leaves one line for another."""
     spline, n = fit.spline, len(fit.spline.control)
     piece = (spline.stop - spline.start) / (n - 3)
     begins = spline.start + piece * np.arange(n - 3)
-    third = np.linalg.norm(bending(n) @ spline.control, axis=1) / piece**3
-    return float(np.log(np.clip(third[(begins + piece > fit.start) & (begins < fit.stop)].max() / BEND_SIGMA, 1, 100)))
+    D = bending(n) / piece**3
+    third, error = D @ spline.control, sum(np.einsum('ij,jk,ik->i', D, fit.covariance[k::3, k::3], D) for k in range(3))
+    square = (third * third).sum(axis=1) - error
+    return 0.5 * float(np.log(np.clip(square[(begins + piece > fit.start) & (begins < fit.stop)].max() / BEND_SIGMA**2,
+                                      1, 1e4)))
 
 
 def at_first_sight(points: np.ndarray, sheet: Sheet, radius: float) -> np.ndarray:
@@ -164,7 +168,7 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, bl
     number = count // block
     blocks = dark[PAST:PAST + number * block].reshape(number, block, -1).mean(axis=1)
     beside = blocks[:, (np.abs(x) > 2.5 * half + 2) & (np.abs(x) < x[-1] - width + 1)]
-    spread = 1.4826 * middle(np.abs(beside - middle(beside.ravel())).ravel()) + 1e-12
+    spread = local_spread(beside, AROUND)
     on = blocks[:, np.abs(x) <= 1].max(axis=1)
     usual = max(float(middle(on)), 1e-9)
     ratio = on / spread

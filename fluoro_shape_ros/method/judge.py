@@ -72,7 +72,7 @@ class Judge:
 
     def confidence(self, probability: float) -> float:
         """The calibrated probability that the chosen one of several curves is right."""
-        p = np.clip(probability, 1e-12, 1 - 1e-12)
+        p = np.clip(probability, 1e-9, 1 - 1e-9)
         return float(1 / (1 + np.exp(-(self.offset + self.slope * np.log(p / (1 - p))))))
 
     def settles(self, log_odds: float, least: float) -> bool:

@@ -35,6 +35,7 @@ from fluoro_shape_ros.imaging.strips import (
     cut_along,
     half_width_range,
     lay_out,
+    local_spread,
     measure,
     search,
 )
@@ -318,9 +319,20 @@ def test_clutter_is_what_noise_makes_of_a_line_that_is_not_there(direction):
     device in the middle does not count."""
     shape = shadow(HALF_WIDTH, np.arange(-6, 7))
     for noise, depth in ((3.0, 0.0), (3.0, 60.0), (6.0, 0.0)):
-        spread = clutter(strips_of(direction, noise=noise, depth=depth, reach=40), shape[None], 12.0, 3)
+        spread = clutter(strips_of(direction, noise=noise, depth=depth, reach=40), shape[None], 12.0, 3, 1000)
         # interpolation smooths a little
         assert_allclose(spread, noise / np.linalg.norm(shape - shape.mean()) / np.sqrt(3), rtol=0.3)
+
+
+def test_the_spread_is_that_of_the_rows_around():
+    rng = np.random.default_rng(1)
+    values = rng.normal(5.0, np.where(np.arange(400) < 200, 1.0, 4.0)[:, None], (400, 50))
+    spread = local_spread(values, 40)
+    assert_allclose(spread[:160], 1.0, rtol=0.1)
+    assert_allclose(spread[240:], 4.0, rtol=0.1)
+    assert (np.diff(spread[180:220]) > 0).all()
+    assert_allclose(local_spread(7 * values - 3, 40), 7 * spread)
+    assert_allclose(local_spread(values, 1000), 1.4826 * np.median(np.abs(values - np.median(values))), rtol=1e-3)
 
 
 def test_distortion_is_known_at_three_offsets_of_a_strip():

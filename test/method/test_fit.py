@@ -160,6 +160,18 @@ def test_what_one_plane_alone_shows_beside_an_end_is_no_bend(shown_in):
     assert_allclose(ends(f), truth[[0, -1]], atol=0.4e-3)
 
 
+def test_a_band_beyond_a_pale_stretch_that_bends_says_that_it_goes_on():
+    """4 mm that are not seen, then 3 mm that are, on an arc of 10 mm."""
+    whole = bent(60, over=0.0105, after=0.0)
+    seen, pale = 40e-3 + 3.5e-3, 4e-3
+    device, band = whole[:round(seen / STEP)], whole[round((seen + pale) / STEP):]
+    f = fitted(photographed(device, [(band, (True, True))]), device)
+    assert f.farther[0] < 1 and f.farther[1] > 5
+    assert f.bent is not None and np.linalg.norm(nearest(f.bent[:-1], whole), axis=1).max() < 0.6e-3
+    assert np.linalg.norm(f.bent[-1] - whole[-1]) < 1.5e-3
+    assert fitted(photographed(device), device).farther.max() < 1
+
+
 def hidden_in_one(slant, plane, turn_deg=20):
     """A fit of a device whose end a line hides in one plane, and the device's ends."""
     truth = bent(turn_deg)

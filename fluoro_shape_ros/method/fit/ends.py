@@ -38,8 +38,12 @@ def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1) -> np.
     clutter: (2, N) or (2, 1) how dark places beside the device happen to look over SMOOTH_PX. What a single plane shows
     may be another line: the other counts.
     """
-    least = np.maximum(_both_show(presence / np.maximum(clutter, PALEST), max(SMOOTH_PX // step_px, 1)), 0.0)
-    return (np.minimum(0.5 * least * least, SURE) - ABSENT) * (step_px / SMOOTH_PX)
+    return nats(_both_show(presence / np.maximum(clutter, PALEST), max(SMOOTH_PX // step_px, 1)), step_px)
+
+
+def nats(z: np.ndarray, step_px: int) -> np.ndarray:
+    """What strips say for a device that stands out by `z` standard deviations over SMOOTH_PX."""
+    return (np.minimum(0.5 * np.maximum(z, 0.0)**2, SURE) - ABSENT) * (step_px / SMOOTH_PX)
 
 
 def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1,

@@ -30,7 +30,7 @@ from ...imaging.strips import (
     measure,
     search,
 )
-from .bends import GROWTH_PX, bent_on
+from .bends import bent_on
 from .ends import BLURS_PX, BRIDGED_PX, GOES_ON, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
 from .neighbours import without_neighbours
 from .solver import EndRow, Layout, Solution, solve
@@ -40,12 +40,13 @@ MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 LONGEST_PX = 16000      # OpenCV samples 32767 rows at once: the strips of both planes
 COARSE_STEP = 3         # px between the strips of a coarse round
 ASTRAY_PX = 1.0         # strips whose device lies farther off do not tell how far
+AROUND_PX = 45          # along the curve, whose surroundings tell the noise
 SETTLED_PX = 0.1        # a fine round that moves the curve less is the last: strips tell offsets so small exactly
 WIDE_PX = 8.0           # extra reach of the strips while the start is still rough
 EXTENSION_PX = 26.0     # how far beyond the presumed ends is looked at once
 NEAR_END_PX = 8
 ASTRAY = 0.04           # px a px, that it may bend away past an end
-GROWTH = 8              # how often the curve may be prolonged
+GROWTH_PX, GROWTH = 30, 8       # how far the curve is prolonged at once, and how often
 # strips around an end, and how far from the first guess it is looked for
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0
 UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the
@@ -58,7 +59,7 @@ GOES_ON_ALONE = 0.6     # darkness past an end in one plane alone, as a share of
 BARE, HIDES = 0.25, 0.7         # darkness past an end or aside, in a plane that shows it well, and in one where another
                                 # line may hide it ...
 CROSSES = 0.5           # ... that goes across, so that straight on it is less dark
-CROWDED = 0.4           # darkness aside: in both planes, that makes an end hard to see; on average, that may be a bend
+CROWDED = 0.4           # darkness aside in both planes, that makes an end hard to see
 HARD_PX = 1.0           # what an end is worth that only one plane shows, or that is hard to see in both
 
 
@@ -80,7 +81,7 @@ class Fit:
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share
                                 # of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
-    farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, see `_Pair.farther`
+    farther: np.ndarray         # (2,) nats by which both planes show it going on past each end, straight on or bent
     alone: np.ndarray           # (2,) the plane that alone tells where each end is, because a line hides it in the
                                 # other; -1: both tell
     moved_px: float             # how far the last step of the solver moved it, at most: a fit that still moves has not
@@ -126,7 +127,10 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
                               half_width, radius)
         slid = np.linalg.norm(found.curve(2) - before, axis=1).max() / step      # in depth, which strips do not see
         found = replace(found, moved_px=max(found.moved_px, float(slid)))
-    return replace(_see_ends(look, found, ends, half_width, radius, seen.clutter), bent=pair.bent(seen, aside))
+    found = _see_ends(look, found, ends, half_width, radius, seen.at_ends[1])
+    nats, bent = bent_on(sheet, found.spline, (found.start, found.stop), step, pair.narrow, *seen.at_ends,
+                         found.open_end, pair.look_px)
+    return replace(found, farther=np.maximum(found.farther, nats), bent=bent)
 
 
 @dataclass(frozen=True)
@@ -139,13 +143,19 @@ class _Seen:
     measured: Measurement
     within: np.ndarray              # (N,) bool: the strips that counted
     model: Model
-    clutter: np.ndarray             # (2,) see strips.clutter
+    clutter: np.ndarray             # (2, N) see strips.clutter
     stretch: tuple[int, int]        # first and last strip of the device
 
     @property
     def reference(self) -> tuple[float, float]:
         """m, where the device begins and where it ends."""
         return self.layout.s[self.stretch[0]], self.layout.s[self.stretch[1]]
+
+    @property
+    def at_ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2, 2) `usual` darkness, and `clutter`, at the first and the last end (rows) in each plane."""
+        ends = list(self.stretch)
+        return self.measured.usual[:, ends].T, self.clutter[:, ends].T
 
     @property
     def beyond(self) -> np.ndarray:
@@ -185,7 +195,8 @@ class _Pair:
             return None     # it has left the images, or turns back and forth in them
         if coarse is not None:
             spline, reference = self._approach(spline, reference, coarse, near)
-        layout, clutter = Layout.of(spline, self.step), self.clutter(spline, reference)
+        layout = Layout.of(spline, self.step)
+        clutter = self.clutter(spline, reference, layout.s)
         for k in range(fine):
             strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
             within = (layout.s >= reference[0]) & (layout.s <= reference[1])
@@ -194,7 +205,7 @@ class _Pair:
             model = Model.of(own, strips.offsets_px)
             measured = measure(strips, model, within)
             solution = solve(layout, spline, strips, measured, views, within)
-            stretch = supported(measured.presence.T, clutter[:, None] / measured.usual, gap_px=self.gap_px)
+            stretch = supported(measured.presence.T, clutter / measured.usual, gap_px=self.gap_px)
             if stretch is None or (coarse is None and k == 0 and solution.moved_px > ASTRAY_PX):
                 return None
             seen = _Seen(layout, solution, strips, measured, within, model, clutter, stretch)
@@ -218,8 +229,8 @@ class _Pair:
             return spline, reference
         strips = self.cut(layout.basis @ spline.control, layout.slope @ spline.control)
         measured = measure(strips, self.cylinder, within)
-        stretch = supported(measured.presence.T, self.clutter(spline, reference)[:, None] / measured.usual, COARSE_STEP,
-                            self.gap_px)
+        stretch = supported(measured.presence.T, self.clutter(spline, reference, layout.s) / measured.usual,
+                            COARSE_STEP, self.gap_px)
         if stretch is not None:
             reference = (layout.s[stretch[0]], layout.s[stretch[1]])
         return solve(layout, spline, strips, measured, views, within).spline, reference
@@ -229,12 +240,18 @@ class _Pair:
         """The longest stretch of the device that need not be seen."""
         return max(GAP / self.step, BRIDGED_PX)
 
-    def clutter(self, spline: Spline3, reference: tuple[float, float]) -> np.ndarray:
-        """(2,) how dark places beside the curve between two arc lengths (m) happen to look in each plane, see
-        strips.clutter."""
-        strips = cut(self.sheet, *spline.lines(np.arange(*reference, COARSE_STEP * self.step)),
-                     2 * self.reach + WIDE_PX, rough=True)
-        return clutter(strips, self.narrow, self.reach, SMOOTH_PX // COARSE_STEP)
+    @property
+    def look_px(self) -> int:
+        """How far past its ends more of the device is looked for."""
+        return min(round(GAP / self.step), LOOK_PX)
+
+    def clutter(self, spline: Spline3, reference: tuple[float, float], s: np.ndarray) -> np.ndarray:
+        """(2, N) how dark places beside the curve between two arc lengths (m) happen to look in each plane, at (N,) arc
+        lengths, see strips.clutter."""
+        at = np.arange(*reference, COARSE_STEP * self.step)
+        strips = cut(self.sheet, *spline.lines(at), 2 * self.reach + WIDE_PX, rough=True)
+        seen = clutter(strips, self.narrow, self.reach, SMOOTH_PX // COARSE_STEP, AROUND_PX // COARSE_STEP)
+        return np.stack([np.interp(s, at, c) for c in seen])
 
     def grow(self, seen: _Seen) -> tuple[_Seen, np.ndarray]:
         """The curve prolonged as long as that finds more of the device as it runs; (2,) what says that it goes on
@@ -259,17 +276,17 @@ class _Pair:
     def farther(self, seen: _Seen) -> tuple[np.ndarray, np.ndarray]:
         """(2,) px by which the device may go on past the first and the last end, straight on, perhaps beyond a gap; and
         (2,) nats that speak for that."""
-        px = np.arange(1, min(round(GAP / self.step), LOOK_PX), COARSE_STEP)
+        px = np.arange(1, self.look_px, COARSE_STEP)
         s = np.array(seen.reference)[:, None] + OUTWARD[:, None] * (px + SMOOTH_PX) * self.step
         strips = cut(self.sheet, *seen.solution.spline.lines(s.ravel()), self.reach + WIDE_PX, rough=True)
-        far, nats, usual = np.zeros(2), np.zeros(2), middle(seen.measured.usual)[:, None]
+        far, nats, usual, beside = np.zeros(2), np.zeros(2), *seen.at_ends
         for k in (0, 1):
             mine = slice(k * len(px), (k + 1) * len(px))
             straight = np.abs(strips.offsets_px) <= 1 + px[:, None] * ASTRAY     # it need not go on quite straight
             dark = [np.where(straight, depth_across(p[mine], t), -np.inf).max(axis=1)
                     for p, t in zip(strips.profiles, self.narrow)]
-            total = np.cumsum(evidence(np.where(strips.inside[:, mine], dark, np.nan) / usual,
-                                       seen.clutter[:, None] / usual, COARSE_STEP))
+            total = np.cumsum(evidence(np.where(strips.inside[:, mine], dark, np.nan) / usual[k][:, None],
+                                       (beside[k] / usual[k])[:, None], COARSE_STEP))
             best = int(total.argmax())
             far[k], nats[k] = px[best], max(float(total[best]), 0.0)
         return far, nats
@@ -282,14 +299,6 @@ class _Pair:
         strips = cut(self.sheet, *seen.solution.spline.lines(s), self.reach + WIDE_PX, rough=True).halves()
         line = search(strips, self.template.repeat(2, axis=0))
         return middle(line.presence[:, (px > 6) & (px < 18)]).reshape(2, 2).T
-
-    def bent(self, seen: _Seen, aside: np.ndarray) -> np.ndarray | None:
-        """(N, 3) m, see `Fit.bent`."""
-        maybe = aside.mean(axis=1) > CROWDED
-        if not maybe.any():
-            return None
-        return bent_on(self.sheet, seen.solution.spline, seen.reference, self.step, self.narrow,
-                       middle(seen.measured.usual), seen.clutter, maybe & seen.known_beyond)
 
     def cut(self, points: np.ndarray, tangents: np.ndarray) -> Strips:
         """Strips across the projections of (N, 3) points with (N, 3) tangents."""
@@ -354,8 +363,9 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
     height, inner = _levels(twice(seen.presence), OUTWARD[:, None] * (np.array(reference)[:, None] - s), s[1] - s[0])
-    noise = _noise(seen, found.clutter)
-    located = locate(twice(s), twice(seen.presence) / height[..., None], twice(noise) / height, twice(strips.speed),
+    usual, beside = found.at_ends
+    noise = np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * beside / np.nan_to_num(usual, nan=1e-9))
+    located = locate(twice(s), twice(seen.presence) / height[..., None], noise / height, twice(strips.speed),
                      np.array(reference), OUTWARD,
                      *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
     start_stop, ends = [end.at for end in located], list[End | None](located)
@@ -368,12 +378,6 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
                solution.offset_px.T,
                across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
                np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
-
-
-def _noise(seen: Measurement, clutter: np.ndarray) -> np.ndarray:
-    """(2,) standard deviation of presence in each plane, as it is averaged along the curve: that of what lies beside
-    the device, where that is more than noise."""
-    return np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual), nan=1e-9))
 
 
 def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray]:
@@ -406,7 +410,8 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[f
     there = speed[:, :, len(window) // 2]
     height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
     shape = _shape_of_end(there, scale, f.across, radius)
-    noise = np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9)      # (planes,)
+    # (ends, planes)
+    noise = np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual), nan=1e-9).reshape(2, 2).T
     again = locate(s, presence / height[..., None], np.maximum(seen.presence_sigma.reshape(2, 2).T, noise) / height,
                    speed, at, OUTWARD, *shape, density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
     hard, sigma = crowded(f), np.zeros(2)
@@ -418,7 +423,7 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[f
                                                               else again[k].sigma).honest_sigma
         if end is not None and inner[k] < np.inf:
             further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]),
-                                        clutter / np.nan_to_num(middle(seen.usual.reshape(2, -1)), nan=1e-9), step)
+                                        noise[k] / np.sqrt(SMOOTH_PX), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
     told = [(end.seen_at, end.seen_sigma) if end is not None and v < 0 and not h else np.full((2, 2), np.nan)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...data import View
 from ...geometry.cameras import fundamental, isocenter, pixels_per_metre, undistort
-from ...imaging.lines import Candidate, find_candidates
+from ...imaging.lines import GAP_PX, Candidate, find_candidates
 from ...imaging.oriented import along_lines
 from ...imaging.parallel import both
 from ...imaging.profiles import apparent_width, likeness, odd_width, pieces
@@ -28,6 +28,7 @@ FLIPPED = 0.7           # score of a pair of lines read the other way round, as 
 UNLIKE, ODD = 0.3, 0.6  # difference to a cylinder's profile (correlation), and to its width (logarithm), that make a
                         # line less likely the device's
 FAINT_LENGTH_PX = 7.0   # sigma along which faint lines are averaged, in px of the smaller image
+FAINT_GAP_PX = 96.0     # longest gap that is bridged in them: some of them are seen in pieces only
 FAINT_SCALE = 0.7       # of the half width there, that is the filter's scale; at least FINEST px
 FINEST = 0.9
 
@@ -72,7 +73,7 @@ def _candidates(image: np.ndarray, field: np.ndarray, half_width_px: float, min_
                 faint: bool) -> list[Candidate]:
     ridges = (_faint_ridges(image, field, half_width_px) if faint
               else find_ridges(image, field, ridge_scale(half_width_px), shrinking(half_width_px)))
-    lines = find_candidates(ridges, min_length_px, count=LINES)
+    lines = find_candidates(ridges, min_length_px, LINES, FAINT_GAP_PX if faint else GAP_PX)
     if not lines:
         return []
     strips, of = cut_along(image, field, [line.points_px for line in lines], half_width_range(half_width_px))
