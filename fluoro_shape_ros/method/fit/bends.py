@@ -30,7 +30,7 @@ def bent_on(sheet: Sheet, spline: Spline3, ends: tuple[float, float], step: floa
     both, px = np.arange(2), np.arange(2 * STEP_PX, reach_px + max(BACK_PX), STEP_PX)
     outward = np.array([-1, 1])
     clutter = np.maximum((clutter / usual).T, PALEST)[:, :, None, None, None]       # planes, ends
-    back, bend, farther = np.tile(BACK_PX, (2, 1)), np.zeros((2, len(BACK_PX), 2)), np.zeros(2)
+    back, bend = np.tile(BACK_PX, (2, 1)), np.zeros((2, len(BACK_PX), 2))
     for apart in APART:
         s = np.array(ends)[:, None] - outward[:, None] * back * step                                # (2, B)
         points, tangents = (x.reshape(*s.shape, 1, 3) for x in spline.lines(s.ravel()))
@@ -49,6 +49,10 @@ def bent_on(sheet: Sheet, spline: Spline3, ends: tuple[float, float], step: floa
             # what was known of the device before its end does not count, and of so many arcs the best may show noise
             known = (SURE - ABSENT) / SMOOTH_PX * back + np.log(z[0, ..., 0].size)
             farther = (np.cumsum(moves * nats(z, STEP_PX), axis=-1).max(axis=(2, 3)) - known).max(axis=1)
+            farther = np.where(open_end, 0.0, np.maximum(farther, 0.0))
+            goes_on = farther > GOES_ON
+            if not goes_on.any():
+                return farther, None
         # the more of an arc lies in the middle of a line the better; what is not seen counts as in `nats`
         seen = (z > 0) & (0.5 * z * z > ABSENT)
         gain = np.cumsum(np.where(seen, np.clip(presence.min(axis=0), 0, 1), -ABSENT / SURE), axis=-1)
@@ -56,10 +60,6 @@ def bent_on(sheet: Sheet, spline: Spline3, ends: tuple[float, float], step: floa
         begin = gain.max(axis=2).argmax(axis=1)
         best = gain[both, begin].argmax(axis=1)
         back, bend = back[both, begin][:, None], bends[both, begin, best][:, None]
-    farther = np.where(open_end, 0.0, np.maximum(farther, 0.0))
-    goes_on = farther > GOES_ON
-    if not goes_on.any():
-        return farther, None
     start, stop = ends - outward * back[:, 0] * step * goes_on
     arc = both, begin, best
     on = [p[:n + 1] if on else p[:0] for p, n, on in zip(places[arc], far[arc], goes_on)]
