@@ -414,7 +414,7 @@ def _shape_of_end(profiles: np.ndarray, inside: np.ndarray, inward: np.ndarray, 
                                      for *planes, n in zip(profiles, inside, near)]))
     depth, usual = (1 - np.sqrt(np.clip(1 - c, 0.01, 1)) for c in (straight_on(contrast, sine), across))
     darker = (depth / np.maximum(usual, 1e-3)).min(axis=1, keepdims=True)
-    return (bulge(radius, speed, np.array(half_width) / radius, 1 - np.clip(1 - darker * usual, 0.1, 1)**2),
+    return (bulge(radius, speed, np.array(half_width) / radius, across, 1 - np.clip(1 - darker * usual, 0.1, 1)**2),
             radius * np.sqrt(1 - sine**2) / sine)
 
 
