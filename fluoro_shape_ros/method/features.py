@@ -20,7 +20,7 @@ from .fit.solver import BEND_SIGMA
 
 BLOCK = 12              # strips, along which darkness is averaged
 WIDER, BLUR_PX = 1.2, 1.0  # half a line's width is taken as so many times that of the device, and so much more for blur
-AROUND = 8              # blocks, whose surroundings tell the noise
+AROUND = 16             # blocks, whose surroundings tell the noise
 PAST = 18               # strips looked at past either end
 CLEAR = 2.5             # signal to noise, at which a block is darker than nearly all places beside the curve
 MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose closest-point mean is within the larger
