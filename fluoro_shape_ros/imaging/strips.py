@@ -281,10 +281,11 @@ def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int, a
 
 
 def local_spread(values: np.ndarray, rows: int) -> np.ndarray:
-    """(N,) standard deviation of (N, W) values around each row, from the median of blocks of so many rows (which few
-    lines there do not move), interpolated between them."""
-    rows = min(max(rows, 1), len(values))
-    first, count = len(values) % rows // 2, len(values) // rows     # the same from either end
+    """(N,) standard deviation of (N, W) values around each row, from the median of blocks of at least so many rows
+    (which few lines there do not move), interpolated between them."""
+    count = max(len(values) // rows, 1)
+    rows = len(values) // count
+    first = (len(values) - count * rows) // 2       # the same from either end
     blocks = values[first:first + count * rows].reshape(count, -1)
     spread = 1.4826 * middle(np.abs(blocks - middle(blocks)[:, None])) + 1e-12
     return np.interp(np.arange(len(values)), first + (np.arange(count) + 0.5) * rows - 0.5, spread)

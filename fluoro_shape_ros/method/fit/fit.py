@@ -452,6 +452,7 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[f
                                         noise[k] / np.sqrt(SMOOTH_PX), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
+    sigma = np.minimum(sigma, f.stop - f.start)     # an end that no plane shows lies somewhere along the curve
     told = [(end.seen_at, end.seen_sigma) if end is not None and v < 0 and not h else np.full((2, 2), np.nan)
             for end, v, h in zip(ends, by, hard)]
     return replace(f, start=float(at[0]), stop=float(at[1]), end_sigma=sigma * ~f.open_end, alone=alone,
