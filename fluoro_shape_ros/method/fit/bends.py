@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter1d
 
 from ...geometry.curve import arcs
 from ...geometry.spline import Spline3
-from ...imaging.strips import Sheet, cut
+from ...imaging.strips import Sheet, cut, depth_across
 from .ends import ABSENT, GOES_ON, PALEST, SMOOTH_PX, SURE, nats
 
 STEP_PX = 3             # between places on an arc
@@ -78,9 +78,6 @@ def _darkness(sheet: Sheet, points: np.ndarray, tangents: np.ndarray,
     """(2, N) how dark a line with these shadows is in each plane, at most a px beside (N, 3) points, NaN outside its
     field; and (2, N) px per m of the way along unit tangents."""
     strips = cut(sheet, points, tangents, shadows.shape[1] // 2 + 1, rough=True)
-    dark = np.empty(strips.inside.shape)
-    for v, (profiles, shadow) in enumerate(zip(strips.profiles, shadows)):
-        centred = (shadow - shadow.mean()).astype(np.float32)
-        beside = np.stack([np.pad(centred, pad) for pad in ((0, 2), (1, 1), (2, 0))], axis=1)
-        dark[v] = (profiles @ -beside).max(axis=1) / (centred @ centred)
+    near = np.abs(strips.offsets_px) <= 1
+    dark = [depth_across(p, t)[:, near].max(axis=1) for p, t in zip(strips.profiles, shadows)]
     return np.where(strips.inside, dark, np.nan), strips.speed

@@ -130,19 +130,18 @@ def _known(presence: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(presence), np.clip(presence, -99, 99), 0).astype(np.float32)
 
 
-def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.ndarray,
-          at_end: np.ndarray | None = None) -> np.ndarray:
+def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     """(2,) m by which the shadow of a flat end reaches beyond the axis' end in each plane, seen at an angle.
 
     The end's rim is an ellipse. An opaque device shows all of it: r cos / sin of the angle between ray and axis, times
     0.69 for a step fitted to it (0.785 on average over the width, most of it near the middle).
     A translucent one fades from r cos before the end to r cos after it and is half as dark (Beer-Lambert) a little past
-    the middle. contrast: (2,) of the device, which tells whether it is opaque; at_end: that of its end, if it differs.
+    the middle. `contrast` (2,) tells which.
     """
     sine = np.clip(speed / px_per_m, 0.2, 1.0)
     opaque = 0.69 * np.clip((contrast - OPAQUE[0]) / (OPAQUE[1] - OPAQUE[0]), 0.0, 1.0)
-    at_end = np.clip(contrast if at_end is None else at_end, 0.01, 0.95)
-    half_dark = np.log1p(-0.5 * at_end) / np.log1p(-at_end)     # share of the full path that takes half of it
+    depth = -np.log1p(-np.clip(contrast, 0.01, 0.95))                   # mu 2 r
+    half_dark = -np.log1p(-0.5 * np.clip(contrast, 0.01, 0.95)) / depth # share of the full path that takes half of it
     return np.maximum(opaque, 0.5 * (1 - 2 * half_dark)) * radius * np.sqrt(1 - sine**2) / sine
 
 

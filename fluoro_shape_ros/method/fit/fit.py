@@ -31,20 +31,7 @@ from ...imaging.strips import (
     search,
 )
 from .bends import bent_on
-from .ends import (
-    BLURS_PX,
-    BRIDGED_PX,
-    GOES_ON,
-    LOCAL_PX,
-    SMOOTH_PX,
-    End,
-    bulge,
-    evidence,
-    level,
-    locate,
-    past_band,
-    supported,
-)
+from .ends import BLURS_PX, BRIDGED_PX, GOES_ON, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
 from .neighbours import without_neighbours
 from .solver import EndRow, Layout, Solution, solve
 
@@ -368,19 +355,19 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
     between = (s > reference[0]) & (s < reference[1])
     profile = [mean_profile(p, between & i) for p, i in zip(strips.profiles, strips.inside)]
-    across = straight_on(contrast_of(np.stack(profile)), middle(strips.speed[:, between]) * radius / half_width)
+    contrast = contrast_of(np.stack(profile))
+    scale = np.array(half_width) / radius
+    across = straight_on(contrast, middle(strips.speed[:, between]) / scale)
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
     # it runs out of a field before its end
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
-    inward = OUTWARD[:, None] * (np.array(reference)[:, None] - s)
-    height, inner = _levels(twice(seen.presence), inward, s[1] - s[0])
+    height, inner = _levels(twice(seen.presence), OUTWARD[:, None] * (np.array(reference)[:, None] - s), s[1] - s[0])
     usual, beside = found.at_ends
     noise = np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * beside / np.nan_to_num(usual, nan=1e-9))
     located = locate(twice(s), twice(seen.presence) / height[..., None], noise / height, twice(strips.speed),
                      np.array(reference), OUTWARD,
-                     *_shape_of_end(twice(strips.profiles), twice(strips.inside), inward, inner, strips.speed[:, at].T,
-                                    across, half_width, radius), blurs_px=BLURS_PX[1:2], inner=inner)
+                     *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
     start_stop, ends = [end.at for end in located], list[End | None](located)
     for k in np.nonzero(open_end)[0]:
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
@@ -400,29 +387,18 @@ def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.nda
     return np.array(height), np.array(inner)
 
 
-def _shape_of_end(profiles: np.ndarray, inside: np.ndarray, inward: np.ndarray, inner: np.ndarray, speed: np.ndarray,
-                  across: np.ndarray, half_width: list[float], radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2, 2) m of `bulge` at each end (rows) in each plane, and (2, 2) m over which each end fades there.
-
-    profiles: (2, 2, N, W) near each end in each plane, `inside` its field; inward: (2, N) m inside the end, `inner`
-    (2,) how far it is as dark as there; speed: (2, 2) px per m along the curve there; across: see Fit. An end is as
-    much darker than the rest as both planes show: what only one does is another line.
-    """
-    sine = np.clip(speed * radius / half_width, 0.1, 1.0)
-    near = (inward > 0) & (inward < np.minimum(inner, LOCAL_PX * np.abs(inward[0, 1] - inward[0, 0]))[:, None])
-    contrast = contrast_of(np.stack([[mean_profile(p, i & n) for p, i in zip(*planes)]
-                                     for *planes, n in zip(profiles, inside, near)]))
-    depth, usual = (1 - np.sqrt(np.clip(1 - c, 0.01, 1)) for c in (straight_on(contrast, sine), across))
-    darker = (depth / np.maximum(usual, 1e-3)).min(axis=1, keepdims=True)
-    return (bulge(radius, speed, np.array(half_width) / radius, across, 1 - np.clip(1 - darker * usual, 0.1, 1)**2),
-            radius * np.sqrt(1 - sine**2) / sine)
+def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray,
+                  radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """(2, 2) m of `bulge` at each end (rows) in each plane, and (2, 2) m over which each end fades there."""
+    sine = np.clip(speed / px_per_m, 0.1, 1.0)
+    return bulge(radius, speed, px_per_m, across), radius * np.sqrt(1 - sine**2) / sine
 
 
 def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[float], radius: float,
               clutter: np.ndarray) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not
-    count."""
-    step, by = f.s[1] - f.s[0], _shown_by_one(f)
+    count. clutter: (2, 2) at each end (rows) in each plane."""
+    scale, step, by = np.array(half_width) / radius, f.s[1] - f.s[0], _shown_by_one(f)
     alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1
                       for end, v in zip(ends, by)])
     at = np.array([x if end is None or v < 0 else end.seen_at[v] for end, v, x in zip(ends, alone, (f.start, f.stop))])
@@ -430,12 +406,10 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[f
     s = at[:, None] + window
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
     # (ends, planes, strips)
-    presence, speed, inside = (x.reshape(2, 2, -1).transpose(1, 0, 2)
-                               for x in (seen.presence, strips.speed, strips.inside))
+    presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))
     there = speed[:, :, len(window) // 2]
     height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
-    profiles = strips.profiles.reshape(2, 2, *strips.profiles.shape[1:]).swapaxes(0, 1)
-    shape = _shape_of_end(profiles, inside, -OUTWARD[:, None] * window, inner, there, f.across, half_width, radius)
+    shape = _shape_of_end(there, scale, f.across, radius)
     # (ends, planes)
     noise = np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual), nan=1e-9).reshape(2, 2).T
     again = locate(s, presence / height[..., None], np.maximum(seen.presence_sigma.reshape(2, 2).T, noise) / height,
