@@ -17,6 +17,7 @@ TOGETHER = 25           # strips along which a structured background errs the sa
 MISFIT = 1.25           # mean square of a strip's rest, in noise variances, that noise alone rarely exceeds over
                         # TOGETHER strips
 PALER, DARKER = 0.15, 4.0       # times as dark as it usually is, that a part of a device may be
+MIDDLE_THIRD = 0.6825   # mean of the middle third of the absolute values of a standard normal variable
 SURELY = 3.0            # standard deviations by which a strip that is darker than usual is so not by noise
 PALE = 0.4              # times as dark as usual, that the line found in a strip at least is
 FOUND_PX = 0.3          # what `search` is worth
@@ -281,13 +282,19 @@ def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int, a
 
 
 def local_spread(values: np.ndarray, rows: int) -> np.ndarray:
-    """(N,) standard deviation of (N, W) values around each row, from the median of blocks of at least so many rows
-    (which few lines there do not move), interpolated between them."""
+    """(N,) standard deviation of (N, W) values around each row, from blocks of at least so many rows, interpolated
+    between them.
+
+    Of a block it is that of a normal distribution whose middle third of absolute deviations from the median has the
+    same mean: as little moved by few lines there as the median of them, and steadier.
+    """
     count = max(len(values) // rows, 1)
     rows = len(values) // count
     first = (len(values) - count * rows) // 2       # the same from either end
     blocks = values[first:first + count * rows].reshape(count, -1)
-    spread = 1.4826 * middle(np.abs(blocks - middle(blocks)[:, None])) + 1e-12
+    apart = np.sort(np.abs(blocks - middle(blocks)[:, None]), axis=1)
+    third = apart.shape[1] // 3
+    spread = apart[:, third:apart.shape[1] - third].mean(axis=1) / MIDDLE_THIRD + 1e-12
     return np.interp(np.arange(len(values)), first + (np.arange(count) + 0.5) * rows - 0.5, spread)
 
 
