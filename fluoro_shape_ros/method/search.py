@@ -130,20 +130,18 @@ class Search:
             if not self._settled():
                 yield False
             fitted = fit(self._sheet, h.curve, self._radius, h.coarse, clearing=h.clearing)
-            if fitted is None or not self._may_be(fitted, h):
+            if fitted is None or not _long_enough(fitted, self._min_length_px):
                 return
-            final = self._measured(fitted)
-            self.tried.append(Attempt(final, h.lines, *self._judge(final)))
-            if fitted.moved_px <= RESTLESS_PX or self.tried[-1].log_odds < HOPELESS:
+            # where no line but a guess led to it, it has to bear that out
+            borne = any(h.lines) or self._guess is None or borne_out(fitted.curve(100), self._guess)
+            if borne:
+                final = self._measured(fitted)
+                self.tried.append(Attempt(final, h.lines, *self._judge(final)))
+            if fitted.moved_px <= RESTLESS_PX or borne and self.tried[-1].log_odds < HOPELESS:
                 break
             h = Hypothesis(fitted.curve(200), h.lines, clearing=h.clearing)     # it has not come to rest
-        if bends and fitted is not None and fitted.bent is not None and self.tried[-1].log_odds > HOPELESS:
+        if bends and borne and fitted and fitted.bent is not None and self.tried[-1].log_odds > HOPELESS:
             yield from self._bring_to_rest(Hypothesis(fitted.bent, h.lines, 1, h.clearing), bends - 1)
-
-    def _may_be(self, f: Fit, h: Hypothesis) -> bool:
-        """Whether a fit is long enough, and, where no line but a guess led to it, bears that out."""
-        return (_long_enough(f, self._min_length_px)
-                and (any(h.lines) or self._guess is None or borne_out(f.curve(100), self._guess)))
 
 
 def _at_most(count: int, hypotheses: Iterator[Hypothesis | None]) -> Iterator[Hypothesis | None]:
