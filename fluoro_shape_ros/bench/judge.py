@@ -7,6 +7,7 @@ scene, the less each of them counts.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -66,10 +67,15 @@ def tasks(scenes: int, first_seed: int, sources: Sources) -> list[Task]:
             for k in range(round(scenes * share))]
 
 
-def gather(task: Task) -> Curves:
-    """Draw a scene and try everything in it, as a search without a clock does where nothing is beyond doubt."""
+def gather(task: Task) -> Curves | None:
+    """Draw a scene and try everything in it, as a search without a clock does where nothing is beyond doubt; None where
+    nothing can be drawn from the seed, which is said on stderr."""
     family = (families() | varied(task.sources))[task.family]
-    case = family.make(task.seed)
+    try:
+        case = family.make(task.seed)
+    except ValueError as error:
+        print(f'left out: {task.family}, seed {task.seed}: {error}', file=sys.stderr)
+        return None
     scene, device = case.scene, family.device and case.device
     frame, config = scene.frame, Config.from_values(robot_radius=scene.radius,
                                                     base_position=scene.base_position.tolist())

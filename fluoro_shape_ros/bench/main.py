@@ -21,7 +21,19 @@ from .case import Family
 from .composites import load
 from .families import ACCURACY, ROBUSTNESS, Sources, families, on_real
 from .latency import moving_scenes
-from .score import CHI2_95, PICTURES, SILENT_MEAN, SILENT_TIP, WITHIN_MEAN, WITHIN_TIP, Answer, Task, Trial, attempt
+from .score import (
+    CHI2_95,
+    PICTURES,
+    SILENT_MEAN,
+    SILENT_TIP,
+    WITHIN_MEAN,
+    WITHIN_TIP,
+    Answer,
+    Task,
+    Trial,
+    attempt,
+    attempt_or_skip,
+)
 from .table import plain, rows, table
 
 DEVICE = 9              # default seed of what moves in front of the node
@@ -324,8 +336,11 @@ def _variety(args, parser: argparse.ArgumentParser) -> int:
                   picture=args.pictures_of if args.pictures and (k < args.pictures or args.pictures_of != 'all')
                           else '')
              for name in names for k, seed in enumerate(variety.seeds(known[name], args.first_seed, args.scenes))]
-    done = tqdm(in_order(attempt, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene', disable=None)
-    trials = list(variety.fewer_pictures(done, args.pictures))
+    done = tqdm(in_order(attempt_or_skip, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene',
+                disable=None)
+    trials = list(variety.fewer_pictures((t for t in done if t is not None), args.pictures))
+    if not trials:
+        raise ToolError('no scene could be drawn')
     print(variety.table(trials))
     if args.json:
         given = {'command': args.command, 'first_seed': args.first_seed, 'base': not args.no_base,
@@ -368,8 +383,8 @@ def _judge(args, parser: argparse.ArgumentParser) -> int:
     if args.scheduler:
         need('distributed', 'cluster')
     tasks = judge.tasks(args.scenes, args.first_seed, sources)
-    scenes = list(tqdm(in_order(judge.gather, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene',
-                       disable=None))
+    done = tqdm(in_order(judge.gather, tasks, args.jobs, args.scheduler), total=len(tasks), unit='scene', disable=None)
+    scenes = [s for s in done if s is not None]
     try:
         content = judge.learn(scenes)
     except ValueError as error:

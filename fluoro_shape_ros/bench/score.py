@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -100,6 +101,20 @@ PICTURES: dict[str, Callable[[Answer], bool]] = {
 }
 
 
+class NotDrawn(ToolError):
+    """Nothing can be drawn from a seed."""
+
+
+def attempt_or_skip(task: Task) -> Trial | None:
+    """The same as `attempt`; None where nothing can be drawn from the seed, which is said on stderr: the other scenes
+    are not lost by it."""
+    try:
+        return attempt(task)
+    except NotDrawn as error:
+        print(f'left out: {error}', file=sys.stderr)
+        return None
+
+
 def attempt(task: Task) -> Trial:
     """Draw the scene of a task and let each method say what it sees. Raises ToolError where the scene can't be drawn.
 
@@ -108,7 +123,9 @@ def attempt(task: Task) -> Trial:
     family = family_of(task)
     try:
         case = family.make(task.seed)
-    except (ValueError, ImportError) as error:      # ImportError: a renderer is missing here
+    except ValueError as error:
+        raise NotDrawn(f'{task.family}, seed {task.seed}: {error}') from error
+    except ImportError as error:    # a renderer is missing here
         raise ToolError(f'{task.family}, seed {task.seed}: {error}') from error
     try:
         least = {} if task.min_confidence is None else {'min_confidence': task.min_confidence}

@@ -193,7 +193,7 @@ def test_pictures_are_taken_of_what_is_asked_for(monkeypatch, wanted, outcome, t
     assert (picture is not None) == taken
 
 
-def test_what_cannot_be_drawn_or_given_is_named(monkeypatch):
+def test_what_cannot_be_drawn_or_given_is_named(monkeypatch, capsys):
     def make(seed):
         if seed == 1:
             raise ValueError('no such shape')
@@ -205,6 +205,11 @@ def test_what_cannot_be_drawn_or_given_is_named(monkeypatch):
                                (0, 0.5, 'some, seed 0: robot_radius')):
         with pytest.raises(ToolError, match=words):
             trial.attempt(Task('some', seed, ('spline',), sources=families.Sources(), radius_error=error))
+    # what cannot be drawn is left out; what is wrong with all of them ends the bench
+    assert trial.attempt_or_skip(Task('some', 1, ('spline',), sources=families.Sources())) is None
+    assert capsys.readouterr().err == 'left out: some, seed 1: no such shape\n'
+    with pytest.raises(ToolError):
+        trial.attempt_or_skip(Task('some', 2, ('spline',), sources=families.Sources()))
 
 
 def test_counted_families_are_tried_from_their_first_scene():
