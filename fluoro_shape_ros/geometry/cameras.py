@@ -145,6 +145,13 @@ def pixels_per_metre(P: np.ndarray, X: np.ndarray) -> float:
     return float(np.sqrt(abs(np.linalg.det(P[:, :3]))) / abs(np.mean(depth(P, X))))
 
 
+def slant(P: np.ndarray, X: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """(N,) sine of the angle at which rays meet (N, 3) tangents T at (N, 3) points."""
+    ray = X - source(P)
+    return (np.linalg.norm(np.cross(ray, T), axis=1)
+            / np.maximum(np.linalg.norm(ray, axis=1) * np.linalg.norm(T, axis=1), 1e-12))
+
+
 def isocenter(views: Sequence[View]) -> np.ndarray:
     """(3,) m, where two planes look: for a biplane system the point nearest to both central rays (through the image
     centres).

@@ -79,11 +79,6 @@ def pieces(profiles: np.ndarray, good: np.ndarray, of: np.ndarray | None = None)
     return middle(profiles[at[first[line][:, None] + within]], axis=1), line
 
 
-def mean_profile(profiles: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """(W,) median of the good ones among (N, W) profiles; all equal where there are none."""
-    return middle(profiles[good], axis=0) if good.any() else np.ones(profiles.shape[-1])
-
-
 def shadow(half_width_px: float, offsets_px: np.ndarray) -> np.ndarray:
     """(W,) profile across a cylinder's shadow of unit depth: the chord sqrt(h^2 - x^2), blurred. h counts in hundredths
     of a px."""
@@ -99,19 +94,6 @@ def _shadow(half_width_cpx: int) -> tuple[np.ndarray, np.ndarray]:
     kernel = np.exp(-0.5 * (np.arange(-32, 33) * 0.125 / BLUR_PX) ** 2)
     blurred = np.convolve(chord, kernel / kernel.sum(), mode='same')
     return x, blurred / blurred.max()
-
-
-def contrast_of(profiles: np.ndarray) -> np.ndarray:
-    """(...) share of the counts that the device takes at the middle of its (..., W) profiles, which are square roots of
-    counts."""
-    return 1 - (profiles[..., profiles.shape[-1] // 2] / np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1),
-                                                                    1e-9)) ** 2
-
-
-def straight_on(contrast: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """What the contrast of a device would be if it were not seen at an angle, of this sine, to its axis
-    (Beer-Lambert)."""
-    return 1 - (1 - contrast) ** np.clip(sine, 0.2, 1)
 
 
 def own_shadow(profiles: np.ndarray, beside: np.ndarray, good: np.ndarray, expected: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from ..geometry.curve import middle
 from ..geometry.spline import Spline3, bending, through
 from ..imaging.strips import Sheet, Strips, cut_at, lay_out, local_spread
 from .fit.fit import MAX_HALF_WIDTH_PX, Fit
-from .fit.solver import BEND_SIGMA
+from .fit.solver import BEND_SIGMA, REDUNDANCY
 
 BLOCK = 12              # strips, along which darkness is averaged
 WIDER, BLUR_PX = 1.2, 1.0  # half a line's width is taken as so many times that of the device, and so much more for blur
@@ -29,6 +29,7 @@ TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 PARTS, FEW = 3, 3       # of a device that are looked at apart for its width, of so many blocks at least
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
 FARTHEST = 50.0         # nats, that some 50 px of a device say that is seen beyond doubt
+FAR_OFF_PX = 3.0        # of the device from the curve: more says no more
 SKETCHED_PX = 2         # between the strips of a curve that was not fitted
 
 
@@ -43,7 +44,7 @@ class Features:
     wide: float         # ln of the width seen to that expected, of the part where that is nearest to none,
                         # where it is wider ...
     narrow: float       # ... and the other way round
-    residual: float     # px rms, of the device from the curve
+    residual: float     # px rms, of the device from the curve, averaged over blocks, beyond what noise explains
     sigma: float        # ln of the curve's, as a share of what it may be off by
     uneven: float       # ln of how abruptly it bends at most, beyond what is usual
     tip_stops: float    # how much darker it is before its tip than past it, as a share of its darkness
@@ -73,9 +74,8 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
     sigma = np.array([np.hypot(fit.end_sigma[tip], _across(fit, (fit.start, fit.stop)[tip])), fit.end_sigma[1 - tip]])
     tip_sigma, base_sigma = np.log(np.clip(sigma / max(TIP, TIP_PX * step), 0.01, 10.0))
     between = (fit.s > fit.start) & (fit.s < fit.stop)
-    left = [np.sqrt(np.nanmean(o[between]**2)) if np.isfinite(o[between]).any() else 3.0 for o in fit.offset_px.T]
     return np.array([
-        *_everywhere(seen), min(max(left), 3.0),
+        *_everywhere(seen), max(_left_over(o[between]) for o in fit.offset_px.T),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
         _uneven(fit), stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, base_sigma,
         np.sqrt(np.clip(fit.aside[tip], 0.0, 2.0).prod()), min(fit.farther[tip] / FARTHEST, 1.0),
@@ -86,6 +86,18 @@ def _across(fit: Fit, s: float) -> float:
     """m, the standard deviation of where a fit runs at an arc length."""
     basis = fit.spline.bases(np.array([s]), 0)[0][0]
     return float(np.sqrt(sum(basis @ fit.covariance[k::3, k::3] @ basis for k in range(3))))
+
+
+def _left_over(offset_px: np.ndarray) -> float:
+    """px rms of the means of blocks of (N,) offsets, NaN where not measured, beyond what their scatter within the
+    blocks explains; at most FAR_OFF_PX, as where there is none."""
+    blocks = offset_px[:len(offset_px) // BLOCK * BLOCK].reshape(-1, BLOCK)
+    known = np.isfinite(blocks).sum(axis=1)
+    blocks, known = blocks[known >= BLOCK // 2], known[known >= BLOCK // 2]
+    if not len(blocks):
+        return FAR_OFF_PX
+    noise = REDUNDANCY * np.nanvar(blocks, axis=1) / (known - 1)
+    return min(float(np.sqrt(max((np.nanmean(blocks, axis=1)**2 - noise).mean(), 0.0))), FAR_OFF_PX)
 
 
 def _uneven(fit: Fit) -> float:

@@ -40,7 +40,7 @@ OFF, MOST = 0.1, 3.0    # of the darkness: what a description is worth at best; 
 TOGETHER_PX = 15.0      # along which a background errs the same way
 SURE = 3.0              # nats, by which one end is the tip rather than the other
 LENGTH, SHARE = 3e-3, 0.03      # m, and share of it: standard deviation of a known length
-FOR, AGAINST = 1.0, -3.0        # nats: most that a description says for a curve, and against it
+FOR, AGAINST = 1.0, -5.0        # nats: most that a description says for a curve, and against it
 CONTRADICTS = -1.0      # nats, from which on it says so in words
 
 

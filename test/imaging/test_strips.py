@@ -15,14 +15,11 @@ from fluoro_shape_ros.imaging.profiles import (
     WIDTHS,
     apparent_width,
     background,
-    contrast_of,
     likeness,
-    mean_profile,
     odd_width,
     own_shadow,
     pieces,
     shadow,
-    straight_on,
 )
 from fluoro_shape_ros.imaging.strips import (
     FOUND_PX,
@@ -89,7 +86,7 @@ def searched(strips):
 
 
 def alike(strips):
-    return likeness(mean_profile(strips.profiles[0], ALL), HALF_WIDTH)[np.abs(WIDTHS - 1).argmin()]
+    return likeness(np.median(strips.profiles[0], axis=0), HALF_WIDTH)[np.abs(WIDTHS - 1).argmin()]
 
 
 @pytest.mark.parametrize('direction', [(1, 0, 0), (0, 0, 1), (-1, 0, 0.4), (1, 0.3, 1)])
@@ -286,20 +283,6 @@ def test_pieces_are_medians_along_each_line_and_a_short_line_is_one():
     assert_allclose(medians[:, 0], [15, 46, 2, 24])
     nothing, none = pieces(along, np.zeros(115, bool), of)
     assert nothing.shape == (0, 3) and len(none) == 0
-
-
-def darkened(*shares):
-    """(B, 9) profiles, square roots of counts, whose middle lacks each of the shares of a background that differs from
-    piece to piece."""
-    counts = np.full((len(shares), 9), 100.0) * np.arange(1, len(shares) + 1)[:, None]
-    counts[:, 4] *= 1 - np.array(shares)
-    return np.sqrt(counts)
-
-
-def test_contrast_by_hand():
-    assert_allclose(contrast_of(darkened(0.2, 0.5)), [0.2, 0.5])
-    # twice the path: 0.8^2 is left
-    assert_allclose(straight_on(np.array([0.2, 0.36]), np.array([1.0, 0.5])), [0.2, 0.2])
 
 
 def test_how_wide_a_line_looks_and_when_that_is_odd():

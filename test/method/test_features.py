@@ -185,6 +185,8 @@ def test_what_the_fit_left_over_is_its_rms_in_the_worse_plane():
     assert_allclose(named(replace(f, offset_px=left + [0.4, -1.2]), sheet)['residual'], 1.2)
     every_second = np.where(np.arange(len(f.s))[:, None] % 2, 1.0, np.nan)
     assert_allclose(named(replace(f, offset_px=left + every_second), sheet)['residual'], 1.0)
+    noise = np.where(np.arange(len(f.s))[:, None] % 2, 2.0, -2.0)                   # averages out
+    assert named(replace(f, offset_px=left + noise), sheet)['residual'] == 0
     assert (named(replace(f, offset_px=left + np.nan), sheet)['residual']
             == named(replace(f, offset_px=left + 9.0), sheet)['residual'] == 3.0)
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.special import ndtr
 
-from fluoro_shape_ros.method.fit.ends import bulge, level, locate, past_band, supported
+from fluoro_shape_ros.method.fit.ends import level, locate, past_band, supported
 
 PX = 1 / 3000.0                                             # m a pixel
 S = np.arange(200) * PX
@@ -104,16 +104,24 @@ def test_how_dark_a_device_is_at_its_end_and_how_far_that_goes(height, length_px
 def test_a_pale_tip_past_a_band_is_measured_where_it_is_seen(tip_px, clutter, expected_px, unsure_px):
     inward = np.arange(-16, 16.5, 0.5) * PX
     p = np.select([inward < -tip_px * PX, inward < 0, inward < 6 * PX], [0.0, 0.4, 3.0], 0.4)
-    past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, clutter), PX)
+    past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, clutter), NONE, PX)
     assert abs(past / PX - expected_px) < 0.5 and sigma / PX < unsure_px
 
 
 def test_a_pale_tip_that_cannot_be_seen_makes_the_end_uncertain():
     inward = np.arange(-16, 16.5, 0.5) * PX
     p = np.select([inward < 0, inward < 6 * PX], [0.0, 3.0], 0.2)
-    past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, 2.0), PX)
+    past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, 2.0), NONE, PX)
     assert 0.3e-3 < past < 0.7e-3 and 0.4e-3 < sigma < 0.8e-3          # half on none, half anywhere up to 2 mm
-    assert past_band(np.ones((2, len(inward))), inward, np.inf, np.full(2, 2.0), PX) == (0, 0)      # no band
+    assert past_band(np.ones((2, len(inward))), inward, np.inf, np.full(2, 2.0), NONE, PX) == (0, 0)      # no band
+
+
+def test_what_a_bands_own_end_may_darken_is_no_pale_tip():
+    inward = np.arange(-16, 16.5, 0.5) * PX
+    p = np.select([inward < 0, inward < 6 * PX], [0.0, 3.0], 0.4) + np.zeros((2, 1))
+    p[0, (inward < 0) & (inward > -5 * PX)] = 0.6                # plane A sees the band's rim at an angle
+    seen = [past_band(p, inward, 6 * PX, np.full(2, 0.03), np.array([rim * PX, 0]), PX)[0] / PX for rim in (0, 5)]
+    assert seen[0] > 1.5 and seen[1] < 0.5
 
 
 def edge(end, outward=1, blur_px=1.1, noise=0.0, beyond=NONE, seed=0):
@@ -196,17 +204,3 @@ def test_planes_that_disagree_widen_sigma_by_half_their_difference(apart_px):
     at, sigma = placed(S, edge(ends), np.full(2, 0.1), SPEED, ends.mean(), 1, NONE)
     assert ends[0] - PX < at < ends[1] + PX
     assert sigma > 0.4 * apart_px * PX
-
-
-def test_bulge_by_hand():
-    ones = np.ones(2)
-    # seen square on: nothing
-    assert_allclose(bulge(0.001, ones, ones, np.array([0.9, 0.2])), 0, atol=1e-12)
-    # 45 degrees: cos / sin = 1
-    slanted, opaque = np.full(2, np.sqrt(0.5)), np.array([0.9, 0.9])
-    reach = bulge(0.001, slanted, ones, opaque)
-    # an ellipse reaches r at its middle, pi / 4 r on average
-    assert (reach > 0.6e-3).all() and (reach < 0.25e-3 * np.pi).all()
-    assert_allclose(bulge(0.002, np.full(2, 0.6) * 3000, ones * 3000, opaque), reach * 2 * 0.8 / 0.6)
-    half = np.log(1 - 0.5 * 0.3) / np.log(1 - 0.3)      # Beer-Lambert: the share of the path that takes half of 30 %
-    assert_allclose(bulge(0.001, slanted, ones, np.array([0.3, 1e-4])), [0.5e-3 * (1 - 2 * half), 0], atol=3e-6)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.config import Config
 from fluoro_shape_ros.data import Frame, Outcome
-from fluoro_shape_ros.imaging.profiles import WIDTHS, likeness, mean_profile, shadow
+from fluoro_shape_ros.imaging.profiles import WIDTHS, likeness, shadow
 from fluoro_shape_ros.imaging.strips import Model, Sheet, Strips, measure
 from fluoro_shape_ros.method.fit.fit import fit
 from fluoro_shape_ros.method.fit.neighbours import without_neighbours
@@ -45,7 +45,7 @@ def cleared(strips):
 
 
 def alike(strips):
-    return likeness(mean_profile(strips.profiles[0], ALL), HALF_WIDTH)[np.abs(WIDTHS - 1).argmin()]
+    return likeness(np.median(strips.profiles[0], axis=0), HALF_WIDTH)[np.abs(WIDTHS - 1).argmin()]
 
 
 def test_without_a_line_beside_it_strips_are_only_cut_shorter():

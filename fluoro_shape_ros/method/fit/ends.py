@@ -17,18 +17,18 @@ LOCAL_PX = 27           # at an end, that tell how dark the device is there
 PALEST = 0.03           # of the usual darkness: a paler device is not told from a background that is no parabola
 ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not
                                 # within so many px
-BAND, SOFT_TIP = 3e-3, 2e-3     # m: longest marker band, and farthest that a device goes on past one at its end
+BAND, SOFT_TIP = 2e-3, 2e-3     # m: longest marker band (electrodes are longer), and farthest that a device goes on
+                                # past one at its end
 SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing
                                 # is seen, since it may be pale
 GOES_ON = 3.0           # nats past an end, that make one look farther
 REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
-OPAQUE = (0.3, 0.55)    # measured contrast at which a device counts as translucent, and as opaque
 RAMP = 0.3              # of the length over which an end fades in a plane, that its model is worth there: how opaque it
                         # looks depends on the display
 DISAGREE = 3.0          # standard deviations by which the planes' ends may differ
-FLOOR_PX = 0.22         # what the model of the edge itself is worth in a plane
+FLOOR_PX = 0.18         # what the model of the edge itself is worth in a plane
 
 
 def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1) -> np.ndarray:
@@ -92,12 +92,13 @@ def level(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarr
     return np.maximum(dark_here, PALEST), float(inner)
 
 
-def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: np.ndarray,
+def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: np.ndarray, rim: np.ndarray,
               px: float) -> tuple[float, float]:
     """m by which the device goes on past a dark band that seems to be its end, and the standard deviation of that: a
     pale tip is often hardly seen.
 
-    presence: (2, N) at (N,) m inside the band's outer edge; inner: m, the band's length; clutter: (2,) see `evidence`.
+    presence: (2, N) at (N,) m inside the band's outer edge; inner: m, the band's length; clutter: (2,) see `evidence`;
+    rim: (2,) m from that edge on that the band's own end, seen at an angle, may darken in each plane.
     Posterior mean over lengths up to SOFT_TIP, half of the prior on none, of a tip as dark as the device is behind the
     band. (0, 0) where there is no band.
     """
@@ -111,7 +112,7 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
     pale, out = np.maximum(pale, PALEST), -inward[past]
     step = np.ptp(out) / (len(out) - 1)
     lengths = np.linspace(0, SOFT_TIP, 21)
-    rest = y[:, past] - pale[:, None] * (out < lengths[:, None, None])
+    rest = (y[:, past] - pale[:, None] * (out < lengths[:, None, None])) * (out > rim[:, None] + px)
     misfit = (rest * rest).sum(axis=2) @ (step / (SMOOTH_PX * px) / np.maximum(clutter, PALEST)**2)
     p = np.exp(-0.5 * (misfit - misfit.min())) * np.where(lengths > 0, 1 / (len(lengths) - 1), 1.0)
     p /= p.sum()
@@ -128,21 +129,6 @@ def _both_show(presence: np.ndarray, strips: int) -> np.ndarray:
 def _known(presence: np.ndarray) -> np.ndarray:
     """(2, N) float32, nothing where it is not known."""
     return np.where(np.isfinite(presence), np.clip(presence, -99, 99), 0).astype(np.float32)
-
-
-def bulge(radius: float, speed: np.ndarray, px_per_m: np.ndarray, contrast: np.ndarray) -> np.ndarray:
-    """(2,) m by which the shadow of a flat end reaches beyond the axis' end in each plane, seen at an angle.
-
-    The end's rim is an ellipse. An opaque device shows all of it: r cos / sin of the angle between ray and axis, times
-    0.69 for a step fitted to it (0.785 on average over the width, most of it near the middle).
-    A translucent one fades from r cos before the end to r cos after it and is half as dark (Beer-Lambert) a little past
-    the middle. `contrast` (2,) tells which.
-    """
-    sine = np.clip(speed / px_per_m, 0.2, 1.0)
-    opaque = 0.69 * np.clip((contrast - OPAQUE[0]) / (OPAQUE[1] - OPAQUE[0]), 0.0, 1.0)
-    depth = -np.log1p(-np.clip(contrast, 0.01, 0.95))                   # mu 2 r
-    half_dark = -np.log1p(-0.5 * np.clip(contrast, 0.01, 0.95)) / depth # share of the full path that takes half of it
-    return np.maximum(opaque, 0.5 * (1 - 2 * half_dark)) * radius * np.sqrt(1 - sine**2) / sine
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from functools import lru_cache, partial
 import numpy as np
 
 from ...data import View
-from ...geometry.cameras import depth, pixels_per_metre
+from ...geometry.cameras import depth, pixels_per_metre, slant
 from ...geometry.curve import arc_length, middle
 from ...geometry.spline import Spline3, prolong, through
-from ...imaging.profiles import background, contrast_of, mean_profile, own_shadow, shadow, straight_on
+from ...imaging.profiles import background, own_shadow, shadow
 from ...imaging.strips import (
     Measurement,
     Model,
@@ -31,11 +31,12 @@ from ...imaging.strips import (
     search,
 )
 from .bends import bent_on
-from .ends import BLURS_PX, BRIDGED_PX, GOES_ON, SMOOTH_PX, End, bulge, evidence, level, locate, past_band, supported
+from .ends import BLURS_PX, BRIDGED_PX, GOES_ON, SMOOTH_PX, End, evidence, level, locate, past_band, supported
 from .neighbours import without_neighbours
-from .solver import EndRow, Layout, Solution, solve
+from .opacity import bulge, exponent, rim
+from .solver import Layout, Solution, solve
 
-COARSE, FINE = 2, 3
+COARSE, FINE = 2, 6
 MAX_HALF_WIDTH_PX = 400.0   # of anything that is looked for
 LONGEST_PX = 16000      # OpenCV samples 32767 rows at once: the strips of both planes
 COARSE_STEP = 3         # px between the strips of a coarse round
@@ -49,9 +50,6 @@ ASTRAY = 0.04           # px a px, that it may bend away past an end
 GROWTH_PX, GROWTH = 30, 8       # how far the curve is prolonged at once, and how often
 # strips around an end, and how far from the first guess it is looked for
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0
-UNKNOWN = 1.0           # variance of the curve along its projection, as a share of that of its ends, from which on the
-                        # ends tell something of it
-SURPRISE = 60.0         # squared difference of the planes' ends that the curve's covariance explains
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far
                                 # past its ends
@@ -76,8 +74,7 @@ class Fit:
     s: np.ndarray               # (N,) m
     presence: np.ndarray        # (N, 2)
     offset_px: np.ndarray       # (N, 2) of the device from the fitted curve; NaN where not measured
-    across: np.ndarray          # (2,) share of the beam that the device takes at its middle, after blur, as if seen
-                                # straight on (Beer-Lambert)
+    power: float                # 1: translucent, 0: opaque, see opacity.exponent
     beyond: np.ndarray          # (2, 2) darkness just past the first and the last end (rows) in plane A, B, as a share
                                 # of the device's
     aside: np.ndarray           # (2, 2) the same of a line beside where each end would go on
@@ -115,19 +112,8 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
     if seen is None:
         return None
     seen, farther = pair.grow(seen)
-    aside = pair.aside(seen)
-    s, look = seen.layout.s, partial(pair.look, seen.model)
-    found, ends = _finish(seen, aside, farther, half_width, radius)
-    agreed = _agree(found, ends, views)
-    if agreed:
-        strips, measured = look(found, s, seen.within)
-        solution = solve(seen.layout, found.spline, strips, measured, views, seen.within, agreed)
-        before = found.curve(2)
-        found, ends = _finish(replace(seen, solution=solution, strips=strips, measured=measured), aside, farther,
-                              half_width, radius)
-        slid = np.linalg.norm(found.curve(2) - before, axis=1).max() / step      # in depth, which strips do not see
-        found = replace(found, moved_px=max(found.moved_px, float(slid)))
-    found = _see_ends(look, found, ends, half_width, radius, seen.at_ends[1])
+    found, ends = _finish(seen, pair.aside(seen), farther, views, radius)
+    found = _see_ends(partial(pair.look, seen.model), found, ends, views, radius, *seen.at_ends)
     nats, bent = bent_on(sheet, found.spline, (found.start, found.stop), step, pair.narrow, *seen.at_ends,
                          found.open_end, pair.look_px)
     return replace(found, farther=np.maximum(found.farther, nats), bent=bent)
@@ -315,19 +301,6 @@ class _Pair:
         return strips, measure(strips, model, within)
 
 
-def _agree(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> list[EndRow]:
-    """Of the ends where the planes differ, those where that tells something of the curve: it is not known well enough
-    to say where it ends."""
-    rows = []
-    for end, by in zip(ends, _shown_by_one(f)):
-        if end is not None and by < 0 and np.isfinite(end.seen_at).all():
-            row = EndRow.of(f.spline, end.at, end.seen_at, end.seen_sigma, views)
-            known = row.row @ f.covariance @ row.row
-            if known > UNKNOWN * row.variance and row.target**2 < SURPRISE * (known + row.variance):
-                rows.append(row)
-    return rows
-
-
 @lru_cache(64)
 def _looks(*half_width_cpx: int) -> tuple[float, np.ndarray, np.ndarray, Model, list[np.ndarray]]:
     """How far strips reach, the shadow of a cylinder of so many hundredths of a px in each plane, and what a _Pair
@@ -348,26 +321,25 @@ def _beyond(presence: np.ndarray, at: int, outward: int) -> np.ndarray:
     return np.where(np.isnan(past).any(axis=0), np.nan, middle(past, axis=0))
 
 
-def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: list[float],
+def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, views: Sequence[View],
             radius: float) -> tuple[Fit, list[End | None]]:
     """The fit, and its ends where they are seen."""
     s, strips, seen, reference, solution = found.layout.s, found.strips, found.measured, found.reference, found.solution
     presence, inside, lit = seen.presence.T, strips.inside.T, strips.lit.all(axis=0)
     between = (s > reference[0]) & (s < reference[1])
-    profile = [mean_profile(p, between & i) for p, i in zip(strips.profiles, strips.inside)]
-    contrast = contrast_of(np.stack(profile))
-    scale = np.array(half_width) / radius
-    across = straight_on(contrast, middle(strips.speed[:, between]) / scale)
     at = np.minimum(np.searchsorted(s, reference), len(s) - 1)
     # it runs out of a field before its end
     open_end = np.array([not inside[max(at[0] - 14, 0):at[0] + 1].all(), not inside[at[1]:at[1] + 14].all()])
     twice = lambda x: np.broadcast_to(x, (2, *x.shape))     # noqa: E731
-    height, inner = _levels(twice(seen.presence), OUTWARD[:, None] * (np.array(reference)[:, None] - s), s[1] - s[0])
+    inward = OUTWARD[:, None] * (np.array(reference)[:, None] - s)
+    height, inner = _levels(twice(seen.presence), inward, s[1] - s[0])
     usual, beside = found.at_ends
+    sine = _slants(solution.spline, s, views)
+    power = exponent(seen.presence * seen.usual, sine, inside.T & between)
     noise = np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * beside / np.nan_to_num(usual, nan=1e-9))
     located = locate(twice(s), twice(seen.presence) / height[..., None], noise / height, twice(strips.speed),
-                     np.array(reference), OUTWARD,
-                     *_shape_of_end(strips.speed[:, at].T, scale, across, radius), blurs_px=BLURS_PX[1:2], inner=inner)
+                     np.array(reference), OUTWARD, bulge(radius, sine[:, at].T, power),
+                     rim(radius, sine[:, at].T), blurs_px=BLURS_PX[1:2], inner=inner)
     start_stop, ends = [end.at for end in located], list[End | None](located)
     for k in np.nonzero(open_end)[0]:
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
@@ -375,9 +347,9 @@ def _finish(found: _Seen, aside: np.ndarray, farther: np.ndarray, half_width: li
         ends[k] = None
     start, stop = start_stop
     return Fit(solution.spline, start, stop, np.zeros(2), open_end, solution.covariance(), s, presence,
-               solution.offset_px.T,
-               across, np.where(np.isnan(beyond := found.beyond), 0.0, beyond), np.where(open_end[:, None], 0.0, aside),
-               np.where(open_end, 0.0, farther), np.full(2, -1), solution.moved_px), ends
+               solution.offset_px.T, power, np.where(np.isnan(beyond := found.beyond), 0.0, beyond),
+               np.where(open_end[:, None], 0.0, aside), np.where(open_end, 0.0, farther), np.full(2, -1),
+               solution.moved_px), ends
 
 
 def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray]:
@@ -387,18 +359,17 @@ def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.nda
     return np.array(height), np.array(inner)
 
 
-def _shape_of_end(speed: np.ndarray, px_per_m: np.ndarray, across: np.ndarray,
-                  radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2, 2) m of `bulge` at each end (rows) in each plane, and (2, 2) m over which each end fades there."""
-    sine = np.clip(speed / px_per_m, 0.1, 1.0)
-    return bulge(radius, speed, px_per_m, across), radius * np.sqrt(1 - sine**2) / sine
+def _slants(spline: Spline3, s: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """(V, N) sine of the angle at which each plane sees a curve at (N,) arc lengths."""
+    points, tangents = spline.lines(s)
+    return np.stack([slant(v.P, points, tangents) for v in views])
 
 
-def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[float], radius: float,
-              clutter: np.ndarray) -> Fit:
+def _see_ends(look: Callable, f: Fit, ends: list[End | None], views: Sequence[View], radius: float,
+              usual: np.ndarray, clutter: np.ndarray) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not
     count. clutter: (2, 2) at each end (rows) in each plane."""
-    scale, step, by = np.array(half_width) / radius, f.s[1] - f.s[0], _shown_by_one(f)
+    step, by = f.s[1] - f.s[0], _shown_by_one(f)
     alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1
                       for end, v in zip(ends, by)])
     at = np.array([x if end is None or v < 0 else end.seen_at[v] for end, v, x in zip(ends, alone, (f.start, f.stop))])
@@ -407,14 +378,14 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[f
     strips, seen = look(f, s, OUTWARD[:, None] * window < 0)
     # (ends, planes, strips)
     presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))
-    there = speed[:, :, len(window) // 2]
     height, inner = _levels(presence, -OUTWARD[:, None] * window, step)
-    shape = _shape_of_end(there, scale, f.across, radius)
+    sine = _slants(f.spline, at, views).T
     # (ends, planes)
     noise = np.sqrt(SMOOTH_PX) * clutter / np.nan_to_num(middle(seen.usual), nan=1e-9).reshape(2, 2).T
     again = locate(s, presence / height[..., None], np.maximum(seen.presence_sigma.reshape(2, 2).T, noise) / height,
-                   speed, at, OUTWARD, *shape, density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
-    hard, sigma = crowded(f), np.zeros(2)
+                   speed, at, OUTWARD, bulge(radius, sine, f.power), rim(radius, sine), density=1 / END_STEP_PX,
+                   reach_px=END_REACH_PX, inner=inner)
+    guess, hard, sigma = at.copy(), crowded(f), np.zeros(2)
     for k, (end, v) in enumerate(zip(ends, alone)):
         if v >= 0 and np.isfinite(again[k].seen_at[v]):
             at[k], sigma[k], hard[k] = again[k].seen_at[v], again[k].seen_sigma[v], True
@@ -422,8 +393,9 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], half_width: list[f
             at[k], sigma[k] = again[k].at, replace(end, sigma=end.sigma if end.sigma > END_REACH_PX * step
                                                               else again[k].sigma).honest_sigma
         if end is not None and inner[k] < np.inf:
-            further, unsure = past_band(presence[k], OUTWARD[k] * (at[k] - s[k]), float(inner[k]),
-                                        noise[k] / np.sqrt(SMOOTH_PX), step)
+            further, unsure = past_band(f.presence.T, OUTWARD[k] * (at[k] - f.s),
+                                        float(inner[k] + OUTWARD[k] * (at[k] - guess[k])),
+                                        clutter[k] / np.nan_to_num(usual[k], nan=1e-9), rim(radius, sine[k]), step)
             at[k], sigma[k] = at[k] + OUTWARD[k] * further, np.hypot(sigma[k], unsure)
     sigma[hard] = np.hypot(sigma[hard], HARD_PX * step)
     sigma = np.minimum(sigma, f.stop - f.start)     # an end that no plane shows lies somewhere along the curve

@@ -10,13 +10,13 @@ import numpy as np
 from scipy.linalg.lapack import dpbsv
 
 from ...data import View
-from ...geometry.cameras import projection_jacobian
 from ...geometry.curve import middle
 from ...geometry.spline import Spline3, bending
 from ...imaging.strips import Measurement, Strips
 
 # 1/m^2: typical change of curvature along a device (third differences of 3 mm at control points 10 mm apart)
 BEND_SIGMA = 3e-3 / 0.01**3
+ABRUPT = 2.0            # times as much, from which on more counts in proportion only: hooks begin, leads are left
 SLIDE = 1e-4            # m: images do not see a curve slide along itself, so no step may
 MODEL_PX = 0.15         # what the model of a strip is worth (0.03 px, the same over some 25 strips), added to the noise
 BLOCK = 16              # strips over which errors that go together (anatomy, crossings) show
@@ -43,8 +43,8 @@ class Layout:
     unknowns: np.ndarray    # (n - 3, BAND) index of those that a piece touches
     band: np.ndarray        # (n - 3, BAND, BAND) where each term of a piece's equations stands in the lower band; past
                             # its end for those above the diagonal
-    stiffness: np.ndarray   # (n, n) 1/m^2: a device bends evenly (third differences of the control points)
-    prior: np.ndarray       # (BAND, 3 n) 1/m^2, lower band: that, and no step slides it along itself
+    bends: np.ndarray       # (n - 3, n) 1/m: third differences of the control points, in their usual size
+    prior: np.ndarray       # (BAND, 3 n) 1/m^2, lower band: no step slides the curve along itself
 
     @classmethod
     def of(cls, spline: Spline3, step: float) -> Layout:
@@ -58,19 +58,27 @@ class Layout:
         below = local[:, None] - local
         band = np.where(below < 0, BAND * 3 * n, below * 3 * n + first + local)
         at, unknowns = np.where(there, starts[:, None] + place, 0), first[:, 0] + local
-        D = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
-        stiffness, (basis, slope) = D.T @ D, spline.bases(s, 0, 1)
+        bends = bending(n) / (BEND_SIGMA * ((spline.stop - spline.start) / (n - 3)) ** 3)
+        basis, slope = spline.bases(s, 0, 1)
         along = ((b[:, :, None] * (slope @ spline.control)[:, None, :]).reshape(-1, BAND)[at[:, ::4]]
                  * (there[:, ::4, None] / SLIDE))
         prior = _sum(band, along.transpose(0, 2, 1) @ along, 3 * n)
         prior[0] += FLOOR
+        return cls(s, basis, slope, b, at, there, unknowns, band, bends, prior)
+
+    def stiff(self, spline: Spline3) -> tuple[np.ndarray, np.ndarray]:
+        """(BAND, 3 n) the prior with what makes a device bend evenly, where it is not known to bend abruptly (weights
+        of Huber 1964); and (3 n,) 1/m what that pulls at the control points with."""
+        uneven = self.bends @ spline.control
+        even = np.minimum(1, ABRUPT / np.maximum(np.linalg.norm(uneven, axis=1), ABRUPT))[:, None]
+        stiffness, prior, n = self.bends.T @ (even * self.bends), self.prior.copy(), len(spline.control)
         for j in range(4):
             prior[3 * j, :3 * (n - j)] += np.repeat(np.diagonal(stiffness, j), 3)
-        return cls(s, basis, slope, b, at, there, unknowns, band, stiffness, prior)
+        return prior, -(self.bends.T @ (even * uneven)).ravel()
 
     def matrix(self, blocks: np.ndarray) -> np.ndarray:
         """(BAND, 3 n) lower band of the sum of the (n - 3, BAND, BAND) overlapping blocks of the pieces."""
-        return _sum(self.band, blocks, 3 * len(self.stiffness))
+        return _sum(self.band, blocks, 3 * self.bends.shape[1])
 
     def vector(self, parts: np.ndarray) -> np.ndarray:
         """(3 n,) sum of the (n - 3, BAND) overlapping parts."""
@@ -96,49 +104,13 @@ class Solution:
         return dpbsv(self.information(), np.eye(self.spline.control.size), lower=1)[1]
 
 
-@dataclass(frozen=True)
-class EndRow:
-    """What both planes' view of one end says of the curve there: row . dC = target."""
-
-    row: np.ndarray     # (3 n,)
-    target: float       # m
-    variance: float     # m^2
-
-    def band(self) -> np.ndarray:
-        """(BAND, 3 n) 1/m^2: the lower band of what it adds to the normal equations."""
-        full = np.outer(self.row, self.row) / self.variance
-        return np.stack([np.append(np.diagonal(full, k), np.zeros(k)) for k in range(BAND)])
-
-    @classmethod
-    def of(cls, spline: Spline3, at: float, seen_at: np.ndarray, seen_sigma: np.ndarray,
-           views: Sequence[View]) -> EndRow:
-        """From where along the curve, m, each plane (2,) sees the device end.
-
-        A curve that runs in an epipolar plane is seen across itself by neither plane; only its ends tell its depth.
-        Moved by dX at its end, plane v sees that end at s_v - t_v J_v dX / |J_v X'|, t_v along the projected curve;
-        both planes must see one end:
-        (t_a J_a / |J_a X'| - t_b J_b / |J_b X'|) dX = s_a - s_b.
-        """
-        s = np.array([at])
-        (basis,), (slope,) = spline.bases(s, 0, 1)
-        X, T = basis @ spline.control, slope @ spline.control
-        steps = []
-        for v in views:
-            J = projection_jacobian(v.P, X)
-            step = J @ T
-            steps.append(step @ J / max(step @ step, 1e-9))
-        row = (basis[:, None] * (steps[0] - steps[1])).ravel()
-        return cls(row, float(seen_at[0] - seen_at[1]), float(seen_sigma @ seen_sigma))
-
-
 def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, views: Sequence[View], within: np.ndarray,
-          ends: Sequence[EndRow] = (), near: bool = True) -> Solution:
-    """One Gauss-Newton step. `ends`: what else must hold. near: the curve lies on the device already, so that what is
-    far off is not it.
+          near: bool = True) -> Solution:
+    """One Gauss-Newton step. near: the curve lies on the device already, so that what is far off is not it.
 
     Residual of strip i in plane v: d_vi - n_vi . J_v(X_i) B_i dC, weighted by its variance and robustly (Tukey's
-    biweight); prior: third differences of the control points. The Jacobian of a projection has rank 2, n picks what is
-    seen across the curve.
+    biweight); prior: third differences of the control points (Huber's function). The Jacobian of a projection has
+    rank 2, n picks what is seen across the curve.
     """
     n, at = len(spline.control), layout.at
     P = np.stack([v.P for v in views])
@@ -153,9 +125,7 @@ def solve(layout: Layout, spline: Spline3, strips: Strips, seen: Measurement, vi
     tabled = lambda x: x[:, at].transpose(1, 0, 2).reshape(n - 3, -1)     # noqa: E731
     d = tabled(seen.offset_px)
     w0 = tabled(within / (REDUNDANCY * seen.variance + MODEL_PX**2)) * np.concatenate([layout.there] * 2, axis=1)
-    prior, pull = layout.prior, -(layout.stiffness @ spline.control).ravel()
-    for end in ends:
-        prior, pull = prior + end.band(), pull + end.row * (end.target / end.variance)
+    prior, pull = layout.stiff(spline)
     r, root, used = d if near else np.zeros_like(d), np.sqrt(w0), w0 > 0
     for _ in range(REWEIGHTED):
         z = r * root
