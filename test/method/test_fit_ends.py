@@ -114,6 +114,7 @@ def test_a_pale_tip_that_cannot_be_seen_makes_the_end_uncertain():
     past, sigma = past_band(np.stack([p, p]), inward, 6 * PX, np.full(2, 2.0), NONE, PX)
     assert 0.3e-3 < past < 0.7e-3 and 0.4e-3 < sigma < 0.8e-3          # half on none, half anywhere up to 2 mm
     assert past_band(np.ones((2, len(inward))), inward, np.inf, np.full(2, 2.0), NONE, PX) == (0, 0)      # no band
+    assert past_band(np.stack([p, p]), inward, -PX, np.full(2, 2.0), NONE, PX) == (0, 0)                  # nor here
 
 
 def test_what_a_bands_own_end_may_darken_is_no_pale_tip():

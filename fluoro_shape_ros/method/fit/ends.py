@@ -102,11 +102,12 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
     Posterior mean over lengths up to SOFT_TIP, half of the prior on none, of a tip as dark as the device is behind the
     band. (0, 0) where there is no band.
     """
-    behind, past = (inward > inner + 2 * px) & (inward < inner + LOCAL_PX * px), inward < -px
-    if inner > BAND or behind.sum() < 6 or past.sum() < 6:
+    inside, past = (inward > 0) & (inward < inner), inward < -px
+    behind = (inward > inner + 2 * px) & (inward < inner + LOCAL_PX * px)
+    if inner > BAND or not inside.any() or behind.sum() < 6 or past.sum() < 6:
         return 0.0, 0.0
     y = np.nan_to_num(presence)
-    band, pale = (np.median(y[:, m], axis=1) for m in ((inward > 0) & (inward < inner), behind))
+    band, pale = (np.median(y[:, m], axis=1) for m in (inside, behind))
     if (pale > ALIKE * band).any():
         return 0.0, 0.0
     pale, out = np.maximum(pale, PALEST), -inward[past]

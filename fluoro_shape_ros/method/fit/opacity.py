@@ -10,7 +10,7 @@ import numpy as np
 
 from ...geometry.curve import middle
 
-USUAL, VARIES = 0.9, 0.3    # exponent of most devices, and its standard deviation among them
+USUAL, VARIES = 0.9, 0.5    # exponent of most devices, and its standard deviation among them
 BLOCK = 12              # strips, that are looked at together
 REWEIGHTED = 8          # times
 RIM = 0.6               # share of its length by which the ellipse of an opaque end counts as an edge (measured)
