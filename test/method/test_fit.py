@@ -11,12 +11,13 @@ from scipy.spatial import cKDTree
 
 from fluoro_shape_ros.data import Frame
 from fluoro_shape_ros.device import load_device
-from fluoro_shape_ros.geometry.cameras import source
+from fluoro_shape_ros.geometry.cameras import project, source
 from fluoro_shape_ros.geometry.curve import arc_length, at_arc_length
 from fluoro_shape_ros.geometry.spline import through
 from fluoro_shape_ros.imaging.field import field_of_view
 from fluoro_shape_ros.imaging.strips import Sheet
-from fluoro_shape_ros.method.fit.fit import fit
+from fluoro_shape_ros.method.fit.ends import End
+from fluoro_shape_ros.method.fit.fit import _confirmed, fit
 from fluoro_shape_ros.method.fit.solver import ABRUPT, Layout
 from fluoro_shape_ros.sim.carm import CArm, biplane
 from fluoro_shape_ros.sim.scenes import xray_run
@@ -274,6 +275,25 @@ def worst_variances(f):
     """(3,) m^2 across the curve, in the worse direction, at three places."""
     u = np.array([0.02, 0.03, 0.04])
     return np.linalg.eigvalsh(lateral(f, u, across(f, u)))[:, 1]
+
+
+def test_ends_that_the_planes_see_at_one_place_tell_the_depth(frame, truth):
+    f = fitted(frame, truth)
+    f = replace(f, covariance=1e-6 * np.eye(f.spline.control.size))
+    basis, slope = (f.spline.bases(np.array([f.stop]), k)[0][0] for k in (0, 1))
+    X, T = basis @ f.spline.control, slope @ f.spline.control
+    steps = []      # m along the curve by which each plane sees the end move, per m of the end's own step
+    for v in VIEWS:
+        move = lambda d: project(v.P, X + d) - project(v.P, X)      # noqa: B023, E731
+        along = move(1e-6 * T) / 1e-6
+        steps.append([along @ move(d) / 1e-6 / (along @ along) for d in 1e-6 * np.eye(3)])
+    row = (basis[:, None] * np.subtract(*steps)).ravel()
+    known, sigma = 1e-6 * row @ row, 1e-4
+    end = lambda apart: End(f.stop, sigma, f.stop + np.array([0, apart]), np.full(2, sigma / np.sqrt(2)))   # noqa: E731
+    told = _confirmed(f, [None, end(0.5 * sigma)], VIEWS)
+    assert_allclose(row @ told @ row, known * sigma**2 / (known + sigma**2), rtol=1e-3)
+    assert _confirmed(f, [None, end(2 * sigma)], VIEWS) is f.covariance      # one of them may be another edge
+    assert _confirmed(f, [None, None], VIEWS) is f.covariance
 
 
 def test_less_dose_is_known_less_well(run, truth, frame):

@@ -14,7 +14,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from ...data import View
-from ...geometry.cameras import depth, pixels_per_metre, slant
+from ...geometry.cameras import depth, pixels_per_metre, projection_jacobian, slant
 from ...geometry.curve import arc_length, middle
 from ...geometry.spline import Spline3, prolong, through
 from ...imaging.profiles import background, own_shadow, shadow
@@ -50,6 +50,7 @@ ASTRAY = 0.04           # px a px, that it may bend away past an end
 GROWTH_PX, GROWTH = 30, 8       # how far the curve is prolonged at once, and how often
 # strips around an end, and how far from the first guess it is looked for
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0
+AGREE = 1.5             # standard deviations by which the planes' ends differ at most, that tell the depth of a curve
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far
                                 # past its ends
@@ -113,6 +114,7 @@ def fit(sheet: Sheet, points: np.ndarray, radius: float, coarse: int | None = CO
         return None
     seen, farther = pair.grow(seen)
     found, ends = _finish(seen, pair.aside(seen), farther, views, radius)
+    found = replace(found, covariance=_confirmed(found, ends, views))
     found = _see_ends(partial(pair.look, seen.model), found, ends, views, radius, *seen.at_ends)
     nats, bent = bent_on(sheet, found.spline, (found.start, found.stop), step, pair.narrow, *seen.at_ends,
                          found.open_end, pair.look_px)
@@ -357,6 +359,26 @@ def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.nda
     m."""
     height, inner = zip(*(level(p, i, px) for p, i in zip(presence, inward)))
     return np.array(height), np.array(inner)
+
+
+def _confirmed(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> np.ndarray:
+    """(3 n, 3 n) covariance of a fit whose ends both planes see at one place, as far as they see it: a curve that runs
+    in an epipolar plane is seen across itself by neither, but its ends tell its depth. Where they differ by more, one
+    of them may be another edge, which tells nothing.
+
+    Moved by dX at its end, plane v sees that end at s_v - t_v J_v dX / |J_v X'|, t_v along the projected curve.
+    """
+    covariance = f.covariance
+    for end, by in zip(ends, _shown_by_one(f)):
+        if end is None or by >= 0 or not end.apart < AGREE * np.hypot(*end.seen_sigma):
+            continue
+        (basis,), (slope,) = f.spline.bases(np.array([end.at]), 0, 1)
+        X, T = basis @ f.spline.control, slope @ f.spline.control
+        a, b = ((J @ T) @ J / max((J @ T) @ (J @ T), 1e-9) for J in (projection_jacobian(v.P, X) for v in views))
+        told = covariance @ (basis[:, None] * (a - b)).ravel()
+        known = (basis[:, None] * (a - b)).ravel() @ told
+        covariance = covariance - np.outer(told, told) / (known + end.seen_sigma @ end.seen_sigma)    # Kalman 1960
+    return covariance
 
 
 def _slants(spline: Spline3, s: np.ndarray, views: Sequence[View]) -> np.ndarray:
