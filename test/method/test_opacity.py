@@ -33,6 +33,13 @@ def test_what_tells_nothing_leaves_the_usual():
     assert exponent(SINE, SINE, ~ALL) == USUAL and exponent(-SINE, SINE, ALL) == USUAL
 
 
+def test_a_curve_that_points_along_a_ray_somewhere_is_no_matter():
+    steep, dark = SINE.copy(), SINE**-1.0
+    steep[0, 100:112] = 0.0
+    assert exponent(dark, steep, ALL) == pytest.approx(1.0, abs=0.1)     # the prior and the medians are moved a little
+    assert np.isfinite(bulge(0.001, np.zeros(2), exponent(dark, 0 * SINE, ALL))).all()
+
+
 def test_bulge_by_hand():
     slanted = np.array([np.sqrt(0.5), 0.6])     # cos / sin = 1 and 4 / 3
     assert_allclose(rim(0.001, slanted), [1e-3, 4e-3 / 3])

@@ -25,8 +25,8 @@ GOES_ON = 3.0           # nats past an end, that make one look farther
 REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
-RAMP = 0.3              # of the length over which an end fades in a plane, that its model is worth there: how opaque it
-                        # looks depends on the display
+RAMP = 0.3              # of the length over which an end fades in a plane, that its model is worth there: tips are flat
+                        # or round
 DISAGREE = 3.0          # standard deviations by which the planes' ends may differ
 FLOOR_PX = 0.18         # what the model of the edge itself is worth in a plane
 

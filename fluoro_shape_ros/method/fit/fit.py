@@ -51,6 +51,7 @@ GROWTH_PX, GROWTH = 30, 8       # how far the curve is prolonged at once, and ho
 # strips around an end, and how far from the first guess it is looked for
 END_WINDOW_PX, END_STEP_PX, END_REACH_PX = 16.0, 0.5, 2.0
 AGREE = 1.5             # standard deviations by which the planes' ends differ at most, that tell the depth of a curve
+BESIDE = 5.0            # ... which itself knows it to so many of them at least
 OUTWARD = np.array([-1, 1])     # from the first end, from the last
 GAP, LOOK_PX = 8e-3, 120        # m, and px at most: bands of a device lie less far apart, so one looks for it that far
                                 # past its ends
@@ -364,7 +365,8 @@ def _levels(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.nda
 def _confirmed(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> np.ndarray:
     """(3 n, 3 n) covariance of a fit whose ends both planes see at one place, as far as they see it: a curve that runs
     in an epipolar plane is seen across itself by neither, but its ends tell its depth. Where they differ by more, one
-    of them may be another edge, which tells nothing.
+    of them may be another edge, which tells nothing; where the curve itself hardly knows its depth, that they do not
+    may be chance: a faint edge is known less well than it seems.
 
     Moved by dX at its end, plane v sees that end at s_v - t_v J_v dX / |J_v X'|, t_v along the projected curve.
     """
@@ -375,9 +377,10 @@ def _confirmed(f: Fit, ends: Sequence[End | None], views: Sequence[View]) -> np.
         (basis,), (slope,) = f.spline.bases(np.array([end.at]), 0, 1)
         X, T = basis @ f.spline.control, slope @ f.spline.control
         a, b = ((J @ T) @ J / max((J @ T) @ (J @ T), 1e-9) for J in (projection_jacobian(v.P, X) for v in views))
-        told = covariance @ (basis[:, None] * (a - b)).ravel()
-        known = (basis[:, None] * (a - b)).ravel() @ told
-        covariance = covariance - np.outer(told, told) / (known + end.seen_sigma @ end.seen_sigma)    # Kalman 1960
+        row, variance = (basis[:, None] * (a - b)).ravel(), float(end.seen_sigma @ end.seen_sigma)
+        told = covariance @ row
+        if row @ told < BESIDE**2 * variance:
+            covariance = covariance - np.outer(told, told) / (row @ told + variance)    # Kalman 1960
     return covariance
 
 
@@ -390,7 +393,7 @@ def _slants(spline: Spline3, s: np.ndarray, views: Sequence[View]) -> np.ndarray
 def _see_ends(look: Callable, f: Fit, ends: list[End | None], views: Sequence[View], radius: float,
               usual: np.ndarray, clutter: np.ndarray) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not
-    count. clutter: (2, 2) at each end (rows) in each plane."""
+    count. usual, clutter: (2, 2) at each end (rows) in each plane, see _Seen."""
     step, by = f.s[1] - f.s[0], _shown_by_one(f)
     alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1
                       for end, v in zip(ends, by)])

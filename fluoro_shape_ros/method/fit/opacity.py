@@ -15,6 +15,8 @@ BLOCK = 12              # strips, that are looked at together
 REWEIGHTED = 8          # times
 RIM = 0.6               # share of its length by which the ellipse of an opaque end counts as an edge (measured)
 
+STEEPEST = 0.1          # sine of the angle between curve and ray: at a smaller one the ray leaves where the curve bends
+
 # Beer-Lambert: depths x of half the attenuation, the exponents x / (exp(x) - 1) that belong to them, and how far the
 # middle of the fading shadow of a slanted end lies past it: at the share of the path that is half as dark
 _DEPTHS = np.linspace(1e-3, 40.0, 4000)
@@ -34,10 +36,10 @@ def exponent(darkness: np.ndarray, sine: np.ndarray, good: np.ndarray) -> float:
     for dark, slanted, g in zip(darkness, sine, good):
         at = np.nonzero(g)[0]
         at = at[:len(at) // BLOCK * BLOCK].reshape(-1, BLOCK)
-        dark, path = dark[at].mean(axis=1), -np.log(slanted[at]).mean(axis=1)
+        dark, path = dark[at].mean(axis=1), -np.log(np.clip(slanted[at], STEEPEST, 1.0)).mean(axis=1)
         seen = dark > 0
         if seen.any():
-            paths.append(path[seen] - path[seen].mean())
+            paths.append(path[seen] - middle(path[seen]))
             darks.append(np.log(dark[seen]) - middle(np.log(dark[seen])))
     x, y = np.concatenate([np.zeros(0), *paths]), np.concatenate([np.zeros(0), *darks])
     if len(x) < 3:
@@ -63,5 +65,5 @@ def bulge(radius: float, sine: np.ndarray, power: float) -> np.ndarray:
 
 def rim(radius: float, sine: np.ndarray) -> np.ndarray:
     """(...) m along the axis from its end to that of the ellipse of the rim."""
-    sine = np.clip(sine, 0.1, 1.0)
+    sine = np.clip(sine, STEEPEST, 1.0)
     return radius * np.sqrt(1 - sine**2) / sine
