@@ -9,7 +9,7 @@ import numpy as np
 from ..data import Shape, View
 from ..geometry.cameras import calibration_covariance
 from ..geometry.curve import arc_length, even_steps, middle
-from .fit.fit import Fit
+from .fit.result import Fit
 
 CALIBRATION_PX = 0.25   # what the best calibration of a plane is worth
 SOME = 12               # points of a backbone at which that is worked out ...
@@ -33,9 +33,10 @@ def backbone(f: Fit, views: Sequence[View], forward: bool, step: float) -> Shape
     basis, slope = f.spline.bases(at, 0, 1)
     points, tangents = basis @ f.spline.control, slope @ f.spline.control
     n = len(f.spline.control)
-    half = (basis @ f.covariance.reshape(n, -1)).reshape(len(at), 3, n, 3)
-    near, weights = f.spline.weights(at, 0)
-    covariance = (np.einsum('mk,mkab->mab', weights, half[np.arange(len(at))[:, None], :, near])
+    near, weights = f.spline.weights(at, 0)     # of the four control points that count at each
+    between = f.covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)[near[:, :, None], near[:, None]]
+    pairs = (weights[:, :, None] * weights[:, None]).reshape(len(at), 1, -1)
+    covariance = ((pairs @ between.reshape(len(at), -1, 9)).reshape(-1, 3, 3)
                   + _displaced(f, views, points, tangents, at))
     tangent = tangents[[0, -1]] / np.linalg.norm(tangents[[0, -1]], axis=1, keepdims=True)
     sigma = f.end_sigma[::1 if forward else -1]
