@@ -26,7 +26,8 @@ from fluoro_shape_ros.imaging.prepare import sheet_of
 from fluoro_shape_ros.imaging.strips import Sheet, cut
 from fluoro_shape_ros.method import judge
 from fluoro_shape_ros.method.features import NAMES, features
-from fluoro_shape_ros.method.fit.fit import Fit, fit
+from fluoro_shape_ros.method.fit.fit import fit
+from fluoro_shape_ros.method.fit.result import Fit
 from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.method.propose.lines import Hypothesis, by_lines, candidates
 from fluoro_shape_ros.overlay import EPIPOLAR, FOUND, grey_levels

@@ -267,17 +267,26 @@ def depth_across(profiles: np.ndarray, shadow: np.ndarray) -> np.ndarray:
     return darkness_across(profiles, shadow) / (centred @ centred)
 
 
-def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: int, around: int) -> np.ndarray:
+def depths(shadow: np.ndarray, places: int) -> np.ndarray:
+    """(w + places - 1, places) float32 what gives, of profiles so wide, the `depth_across` at their middle places."""
+    centred = shadow - shadow.mean()
+    each = np.zeros((places, len(shadow) + places), np.float32)
+    each[:, :len(shadow)] = -centred / (centred @ centred)
+    return each.ravel()[:-places].reshape(places, -1).T     # each row one place farther
+
+
+def clutter(strips: Strips, shadows: np.ndarray, beside_px: float, along: np.ndarray,
+            around: int) -> np.ndarray:
     """(V, N) how dark places farther than `beside_px` from the middle of the strips happen to look around each strip,
     in image values: the spread (see `local_spread`) of what a line with the (V, w) `shadows` of unit depth seems to be
-    there, averaged over `along` strips; those of `around` strips count."""
-    at = np.arange(min(along // 2, len(strips.centers_px[0]) - 1), len(strips.centers_px[0]), along)
+    there, averaged over `along` (V,) strips; those of `around` strips, or of three such stretches, count."""
     spread = np.empty(strips.inside.shape)
-    for v, (profiles, shape) in enumerate(zip(strips.profiles, shadows)):
-        dark = cv2.blur(depth_across(profiles, shape), (1, along))[at]
+    for v, (profiles, shape, n) in enumerate(zip(strips.profiles, shadows, along)):
+        at = np.arange(min(n // 2, len(profiles) - 1), len(profiles), n)
+        dark = cv2.blur(depth_across(profiles, shape), (1, int(n)))[at]
         x, half = strips.offsets_px, len(shape) // 2
         beside = dark[:, (np.abs(x) > beside_px) & (np.abs(x) < x[-1] - half)]
-        spread[v] = np.interp(np.arange(spread.shape[1]), at, local_spread(beside, around // along))
+        spread[v] = np.interp(np.arange(spread.shape[1]), at, local_spread(beside, max(around // n, 3)))
     return spread
 
 

@@ -15,7 +15,8 @@ from ..geometry.cameras import depth, pixels_per_metre
 from ..geometry.curve import middle
 from ..geometry.spline import Spline3, bending, through
 from ..imaging.strips import Sheet, Strips, cut_at, lay_out, local_spread
-from .fit.fit import MAX_HALF_WIDTH_PX, Fit
+from .fit.fit import MAX_HALF_WIDTH_PX
+from .fit.result import Fit
 from .fit.solver import BEND_SIGMA, REDUNDANCY
 
 BLOCK = 12              # strips, along which darkness is averaged

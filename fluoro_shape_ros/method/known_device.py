@@ -24,7 +24,7 @@ from ..device import REFERENCE_KEV, REST, Device, attenuation
 from ..geometry.cameras import pixels_per_metre
 from ..geometry.curve import arc_length, middle
 from ..imaging.strips import Sheet, cut
-from .fit.fit import Fit
+from .fit.result import Fit
 
 STEP = 1e-4             # m, between the places where it is known what a device looks like
 SHIFTS = np.arange(-3e-3, 3.1e-3, 5e-4)     # m, by which a curve's end may be off

@@ -16,7 +16,7 @@ from ..data import Landmarks, View
 from ..geometry.cameras import epipolar_lines, fundamental
 from ..geometry.curve import middle
 from ..imaging.strips import lay_out
-from .fit.fit import Fit
+from .fit.result import Fit
 
 FAR_PX = 10.0           # from the fit's end: there a plane hardly looked for it, and found something else
 AROUND = 13             # strips, that tell how far the device lies beside the curve

@@ -18,7 +18,7 @@ from scipy.special import ndtr
 from ..geometry.cameras import pixels_per_metre
 from ..geometry.curve import middle
 from ..imaging.strips import Model, Sheet, Strips, cut, measure, search
-from .fit.fit import Fit
+from .fit.result import Fit
 from .fit.solver import Layout, solve
 
 LOOKS = search, measure, measure    # across the curve: a sharp edge tells how far it is off only where that is not far

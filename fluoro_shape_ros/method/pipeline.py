@@ -22,7 +22,8 @@ from . import judge, paper
 from .backbone import backbone
 from .continuity import continuity
 from .features import MEAN, MEAN_PX, TIP, TIP_PX, at_first_sight, features
-from .fit.fit import Fit, fit
+from .fit.fit import fit
+from .fit.result import Fit
 from .known_device import ALIKE, CONTRADICTS, Likeness, likeness, verdict
 from .landmarks import landmarks
 from .outline import on_outlines

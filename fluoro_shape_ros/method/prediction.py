@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from ..data import Prior, Reconstruction, View
 from ..geometry.cameras import depth, project
 from ..geometry.curve import arc_length, at_arc_length, even_steps
-from .fit.fit import Fit
+from .fit.result import Fit
 
 STEP = 1e-3             # m, between the points that are looked at
 FLOOR = 1e-3            # m, standard deviation at the base: a robot's base is known best

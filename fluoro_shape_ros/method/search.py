@@ -9,14 +9,15 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..data import View
 from ..geometry.cameras import distort, isocenter, pixels_per_metre, project, undistort
+from ..geometry.curve import distance_to
 from ..imaging.lines import Candidate
 from ..imaging.strips import Sheet
 from .features import MEAN, MEAN_PX, TIP, TIP_PX
-from .fit.fit import COARSE, Fit, fit
+from .fit.fit import COARSE, fit
+from .fit.result import Fit
 from .prediction import Guess, borne_out
 from .propose.follow import follow
 from .propose.lines import Hypothesis, Lines, by_lines, candidates
@@ -215,7 +216,7 @@ def exclusive(a: Attempt, b: Attempt) -> bool:
     if np.linalg.norm(a.tip - b.tip) > 2 * max(TIP, TIP_PX * px):
         return True
     one, other = a.fit.curve(100), b.fit.curve(100)
-    return bool(min(cKDTree(one).query(other)[0].mean(), cKDTree(other).query(one)[0].mean())
+    return bool(min(distance_to(one, other).mean(), distance_to(other, one).mean())
                 > 2 * max(MEAN, MEAN_PX * px))
 
 

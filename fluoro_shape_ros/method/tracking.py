@@ -11,7 +11,8 @@ import numpy as np
 from ..data import Frame, Prior, View
 from ..imaging.prepare import region_around, sheet_of
 from ..imaging.strips import Sheet
-from .fit.fit import Fit, fit
+from .fit.fit import fit
+from .fit.result import Fit
 from .prediction import Guess, borne_out, whole
 from .propose.follow import follow, reach_px
 from .propose.motion import going_on

@@ -30,6 +30,8 @@ from fluoro_shape_ros.imaging.strips import (
     clutter,
     cut,
     cut_along,
+    depth_across,
+    depths,
     half_width_range,
     lay_out,
     local_spread,
@@ -296,13 +298,20 @@ def test_how_wide_a_line_looks_and_when_that_is_odd():
     assert odd_width(1.5, 1.0) < odd_width(1.5, 2.0) < odd_width(1.5, 4.0)     # the fewer pixels, the less is known
 
 
+def test_depths_in_the_middle_are_those_of_the_whole_profile():
+    shape = shadow(HALF_WIDTH, np.arange(-6, 7))
+    profiles = np.random.default_rng(0).normal(500, 20, (30, 17)).astype(np.float32)
+    assert_allclose(profiles @ depths(shape, 5), depth_across(profiles, shape)[:, 6:11], atol=1e-2)
+
+
 @pytest.mark.parametrize('direction', [(0.2, 0, 1), (1, 0, 0.4)])
 def test_clutter_is_what_noise_makes_of_a_line_that_is_not_there(direction):
     """A matched filter of unit depth has the standard deviation noise / |shadow|, over `along` rows its root less; the
     device in the middle does not count."""
     shape = shadow(HALF_WIDTH, np.arange(-6, 7))
     for noise, depth in ((3.0, 0.0), (3.0, 60.0), (6.0, 0.0)):
-        spread = clutter(strips_of(direction, noise=noise, depth=depth, reach=40), shape[None], 12.0, 3, 1000)
+        strips = strips_of(direction, noise=noise, depth=depth, reach=40)
+        spread = clutter(strips, shape[None], 12.0, np.array([3]), 1000)
         # interpolation smooths a little
         assert_allclose(spread, noise / np.linalg.norm(shape - shape.mean()) / np.sqrt(3), rtol=0.3)
 

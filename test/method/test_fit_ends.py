@@ -5,7 +5,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.special import ndtr
 
-from fluoro_shape_ros.method.fit.ends import level, locate, past_band, supported
+from fluoro_shape_ros.method.fit.ends import (
+    ANOTHER,
+    SMOOTH_PX,
+    SURE,
+    goes_on,
+    level,
+    locate,
+    past_band,
+    supported,
+    windows,
+)
 
 PX = 1 / 3000.0                                             # m a pixel
 S = np.arange(200) * PX
@@ -85,6 +95,68 @@ def test_outside_a_field_is_no_support():
 def test_noise_moves_the_stretch_by_a_few_px_only():
     p = presence([(50, 299)], [(50, 299)]) + np.random.default_rng(0).normal(0, 0.25, (400, 2))
     assert_allclose(stretch(p, 0.25 / 3), (50, 299), atol=4)
+
+
+def test_the_fainter_a_device_the_longer_the_window_it_is_seen_over():
+    """Of white noise, a window n times as long is worth sqrt(n) times the standard deviations."""
+    assert_allclose(windows(np.array([20.0, 5.0])), SMOOTH_PX)
+    assert_allclose(windows(np.array([2.5, 0.0])), [4 * SMOOTH_PX, 63])
+    assert_allclose(windows(np.array([np.nan, np.inf])), [63, SMOOTH_PX])
+
+
+def test_a_device_that_one_plane_hardly_shows_is_found_all_along():
+    """1.5 standard deviations over 9 px in plane B: no single window shows it, 400 px do."""
+    whole, short = 0, 0
+    for seed in range(20):
+        noise = np.array([0.4, 2.0])                        # of a strip, as a share of the device's darkness
+        p = presence([(50, 449)], [(50, 449)], n=500) + np.random.default_rng(seed).normal(0, noise, (500, 2))
+        over = noise / 3                                    # over 9 px
+        first, last = supported(p, (over * 3 / np.sqrt(along := windows(1 / over)))[:, None], along_px=along)
+        whole += abs(first - 50) < 20 and abs(last - 449) < 20
+        there = supported(p, over[:, None])
+        short += there is not None and abs(there[0] - 50) < 20 and abs(there[1] - 449) < 20
+    assert whole >= 18 and short < 10
+
+
+CLEAR, FAINT = 20.0, 2.5
+
+
+def going_on(a, b, clear_a=CLEAR, clear_b=CLEAR, px=27, tried=1.0):
+    """Nats of `goes_on` after `px`, where the planes show it by a and b standard deviations over SMOOTH_PX."""
+    z = np.array([[a] * px, [b] * px], float)
+    return goes_on(z, np.array([[clear_a], [clear_b]]), np.ones(z.shape), tried)[-1]
+
+
+def test_what_both_planes_show_beyond_an_end_goes_on():
+    three = 27 / SMOOTH_PX
+    assert_allclose(going_on(CLEAR, CLEAR), three * SURE + ANOTHER)                     # by each for sure
+    assert_allclose(going_on(CLEAR, CLEAR, tried=100.0), three * SURE + ANOTHER - np.log(10))
+    # a faint device: z c - c^2 / 2 a window
+    assert_allclose(going_on(CLEAR, FAINT, clear_b=FAINT), min(three * (SURE + FAINT**2 / 2),
+                                                               three * FAINT**2 / 2 + ANOTHER))
+    assert going_on(0, 0) < 0
+
+
+@pytest.mark.parametrize('b, clear_b', [(0.0, CLEAR), (-1.0, CLEAR), (0.0, FAINT)])
+def test_what_one_plane_shows_beyond_an_end_may_be_another_line(b, clear_b):
+    assert going_on(CLEAR, b, clear_b=clear_b) < ANOTHER
+    assert going_on(CLEAR, b, clear_b=clear_b, px=60) < 0
+
+
+def test_a_faint_plane_does_not_tell_against_what_the_other_shows():
+    """Where a device cannot be seen, that it is not seen tells nothing."""
+    assert going_on(CLEAR, 0.0, clear_b=0.1) > 0.9 * ANOTHER
+
+
+def test_noise_makes_no_band_of_a_plain_end():
+    inward = np.arange(-12, 200) * PX
+    bands = 0
+    for seed in range(100):
+        p = np.where(inward < 0, 0.0, 1.0) + np.random.default_rng(seed).normal(0, 0.9, (2, len(inward)))
+        seen, inner = level(p, inward, PX, np.full(2, 0.9))
+        bands += inner < np.inf
+        assert_allclose(seen, 1, atol=0.6)
+    assert bands < 20
 
 
 @pytest.mark.parametrize('height, length_px, inner_px', [(1.0, 60, np.inf), (3.0, 8, 8), (0.3, 14, 14)])
@@ -168,6 +240,19 @@ def test_sigma_is_the_scatter_over_noise(noise):
     assert 0.5 < np.mean(np.square(z)) < 1.4
     assert abs(np.mean(z)) < 0.35
     assert np.mean(np.abs(z) < 1.96) > 0.88
+
+
+def test_what_a_faint_plane_says_of_an_end_is_worth_little():
+    """Its edge may be any of several."""
+    z, disagreed = [], 0
+    for seed in range(100):
+        end = (90 + 0.173 * seed) * PX
+        p = edge(end) + np.random.default_rng(seed).normal(0, [0.2, 1.5], (200, 2))
+        found, = locate(S[None], p.T[None], np.array([[0.2, 1.5]]), SPEED.T[None], np.array([end]), np.array([1]),
+                        NONE[None], np.zeros((1, 2)))
+        disagreed += found.disagreed
+        z.append((found.seen_at[1] - end) / found.seen_sigma[1])
+    assert disagreed < 3 and 0.3 < np.sqrt(np.mean(np.square(z))) < 1.5 and np.mean(np.abs(z) < 2) > 0.9
 
 
 def test_where_the_planes_differ_the_less_foreshortened_one_counts_more():

@@ -11,7 +11,7 @@ from fluoro_shape_ros.data import Frame, Outcome
 from fluoro_shape_ros.geometry.cameras import epipolar_lines, fundamental, make_view, project
 from fluoro_shape_ros.geometry.curve import arc_length
 from fluoro_shape_ros.geometry.spline import through
-from fluoro_shape_ros.method.fit.fit import Fit
+from fluoro_shape_ros.method.fit.result import Fit
 from fluoro_shape_ros.method.landmarks import landmarks
 from fluoro_shape_ros.method.pipeline import reconstruct
 

@@ -16,7 +16,7 @@ from fluoro_shape_ros.data import Outcome, Prior
 from fluoro_shape_ros.geometry.spline import Spline3
 from fluoro_shape_ros.method import prediction as prior
 from fluoro_shape_ros.method import search
-from fluoro_shape_ros.method.fit.fit import Fit
+from fluoro_shape_ros.method.fit.result import Fit
 from fluoro_shape_ros.method.pipeline import reconstruct
 from fluoro_shape_ros.metrics import Errors
 from fluoro_shape_ros.sim.carm import CArm, biplane

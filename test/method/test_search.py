@@ -105,7 +105,7 @@ LINE = np.c_[np.zeros((100, 2)), np.linspace(0, 0.05, 100)]
 
 def of(odds, points=LINE):
     """An attempt that only has a curve, in pixels of 0.1 mm, its last point the tip, and odds."""
-    at = lambda count: points if count > 2 else points[[0, -1]]     # noqa: E731
+    at = lambda count: points[np.linspace(0, len(points) - 1, count).round().astype(int)]       # noqa: E731
     return Attempt(SimpleNamespace(curve=at, s=np.array([0.0, 1e-4])), (None, None), np.zeros(0), odds, True)
 
 
@@ -123,6 +123,12 @@ def likeliest(tried):
 def test_which_curves_exclude_one_another(other, expected):
     a, b = of(0.0), of(0.0, other)
     assert exclusive(a, b) == exclusive(b, a) == expected
+
+
+def test_a_long_curve_does_not_exclude_itself_begun_a_little_later():
+    """Two ways of taking points of it at even steps lie apart, along it."""
+    line = np.linspace([0.0, 0, -0.25], [0.0, 0, 0.25], 2001)
+    assert not exclusive(of(0.0, line), of(0.0, line[10:]))
 
 
 @pytest.mark.parametrize('a, b', [(3.0, 1.0), (1.0, 3.0), (0.5, 0.5), (-2.0, -4.0)])

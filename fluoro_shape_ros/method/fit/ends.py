@@ -10,10 +10,13 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
+OUTWARD = np.array([-1, 1])     # from the first end, from the last
 PRESENT = 0.5           # of the darkness near an end: there it ends
 BRIDGED_PX = 70         # a stretch that not both planes show does not end the device
-SMOOTH_PX = 9           # along which darkness is averaged
+SMOOTH_PX = 9           # along which darkness is averaged, where a device is clearly seen ...
+CLEARLY, LONGEST_PX = 5.0, 63   # ... by so many standard deviations; else, up to so many px, along what makes it so
 LOCAL_PX = 27           # at an end, that tell how dark the device is there
+FEW_PX, SURELY = 5.0, 1.5   # ... and by so many standard deviations of the mean of so many px
 PALEST = 0.03           # of the usual darkness: a paler device is not told from a background that is no parabola
 ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not
                                 # within so many px
@@ -21,6 +24,7 @@ BAND, SOFT_TIP = 2e-3, 2e-3     # m: longest marker band (electrodes are longer)
                                 # past one at its end
 SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing
                                 # is seen, since it may be pale
+ANOTHER = 5.0           # nats against another line that goes on just where the device ends
 GOES_ON = 3.0           # nats past an end, that make one look farther
 REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
@@ -29,29 +33,51 @@ RAMP = 0.3              # of the length over which an end fades in a plane, that
                         # or round
 DISAGREE = 3.0          # standard deviations by which the planes' ends may differ
 FLOOR_PX = 0.18         # what the model of the edge itself is worth in a plane
+ALONG_PX, NOISELESS = np.full(2, SMOOTH_PX), np.zeros(2)
 
 
-def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1) -> np.ndarray:
+def windows(clear: np.ndarray) -> np.ndarray:
+    """(2,) px along which darkness is averaged, where a device stands out by (2,) `clear` standard deviations over
+    SMOOTH_PX in the planes."""
+    longer = (CLEARLY / np.maximum(np.nan_to_num(clear), 1e-3))**2
+    return SMOOTH_PX * np.rint(np.clip(longer, 1, LONGEST_PX / SMOOTH_PX)).astype(int)
+
+
+def evidence(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1,
+             along_px: np.ndarray = ALONG_PX) -> np.ndarray:
     """(N,) nats by which each strip of (2, N) presence (NaN: outside the field) speaks for a device that both planes
     show, about `step_px` apart.
 
-    clutter: (2, N) or (2, 1) how dark places beside the device happen to look over SMOOTH_PX. What a single plane shows
-    may be another line: the other counts.
+    clutter: (2, N) or (2, 1) how dark places beside the device happen to look over (2,) `along_px`. What a single plane
+    shows may be another line: the other counts.
     """
-    return nats(_both_show(presence / np.maximum(clutter, PALEST), max(SMOOTH_PX // step_px, 1)), step_px)
+    return nats(_both_show(presence / np.maximum(clutter, PALEST), along_px // step_px), step_px, int(max(along_px)))
 
 
-def nats(z: np.ndarray, step_px: int) -> np.ndarray:
-    """What strips say for a device that stands out by `z` standard deviations over SMOOTH_PX."""
-    return (np.minimum(0.5 * np.maximum(z, 0.0)**2, SURE) - ABSENT) * (step_px / SMOOTH_PX)
+def nats(z: np.ndarray, step_px: int, along_px: int = SMOOTH_PX) -> np.ndarray:
+    """What strips say for a device that stands out by `z` standard deviations over `along_px`."""
+    return (np.minimum(0.5 * np.maximum(z, 0.0)**2, SURE) - ABSENT) * (step_px / along_px)
 
 
-def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1,
-              gap_px: float = BRIDGED_PX) -> tuple[int, int] | None:
+def goes_on(z: np.ndarray, clear: np.ndarray, px: np.ndarray, tried: float) -> np.ndarray:
+    """(..., N) nats by which both planes show a device as far as each of N places on a line.
+
+    z: (2, ..., N) standard deviations over SMOOTH_PX by which each place is dark, clear: (2, ..., 1) those by which a
+    device is, px: (2, ..., N) from place to place. tried: the best of so many lines (in space) may show noise. In each
+    plane the likelihood ratio of a device to nothing, as dark as is usual or of any darkness; of both together, but of
+    one alone no more than what it takes to be another line's.
+    """
+    usual = np.minimum(z * clear - 0.5 * clear**2, SURE) / SMOOTH_PX
+    each = np.cumsum(np.maximum(usual, nats(z, 1)) * px, axis=-1)
+    return np.minimum(each.sum(axis=0) - np.log(tried), each.min(axis=0) + ANOTHER - 0.5 * np.log(tried))
+
+
+def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1, gap_px: float = BRIDGED_PX,
+              along_px: np.ndarray = ALONG_PX) -> tuple[int, int] | None:
     """First and last index of the device's stretch of (N, 2) presence, the one that most `evidence` speaks for, to
     where it is PRESENT of as dark as near that end; None where there is none. Bands beyond a pale stretch no longer
     than `gap_px` belong to it, if they are clear enough."""
-    nats = evidence(presence.T, clutter, step_px)
+    nats = evidence(presence.T, clutter, step_px, along_px)
     seen = np.nonzero(nats > 0)[0]
     for k in np.nonzero(np.diff(seen) * step_px > gap_px)[0]:
         nats[seen[k] + 1:seen[k + 1]] = -np.inf
@@ -63,28 +89,34 @@ def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1,
     start = int(total[:stop].argmin())
     if (stop - start) * step_px < 5:
         return None
-    dark = _both_show(presence.T, max(SMOOTH_PX // step_px, 1))[start:stop]
-    near = max(LOCAL_PX // step_px, 1)
+    dark = _both_show(presence.T, along_px // step_px)[start:stop]
+    near = max(LOCAL_PX, *along_px) // step_px
     first, last = (int((d > PRESENT * max(d[:near].max(), 1e-9)).argmax()) for d in (dark, dark[::-1]))
     return (start + first, stop - 1 - last) if (stop - 1 - last - start - first) * step_px >= 5 else None
 
 
-def level(presence: np.ndarray, inward: np.ndarray, px: float) -> tuple[np.ndarray, float]:
-    """(2,) darkness of the device at an end in each plane, and how far inside that it stays so, in the units of
+def level(presence: np.ndarray, inward: np.ndarray, px: float,
+          sigma: np.ndarray = NOISELESS) -> tuple[np.ndarray, float]:
+    """(2,) darkness of the device at an end in each plane, and how far inside that it surely stays so, in the units of
     `inward`: a band, or a pale tip, may be short.
 
-    presence: (2, N); inward: (N,) how far inside the end each strip lies; px: a pixel in these units.
+    presence: (2, N), sigma: (2,) its noise over a px; inward: (N,) how far inside the end each strip lies; px: a pixel
+    in these units.
     """
-    order = np.nonzero((inward > -0.5 * px) & (inward < LOCAL_PX * px))[0]
+    along = windows(np.sqrt(SMOOTH_PX) / np.maximum(sigma, 1e-9))
+    longest = max(along) / SMOOTH_PX
+    order = np.nonzero((inward > -0.5 * px) & (inward < longest * LOCAL_PX * px))[0]
     order = order[np.argsort(inward[order])]
     if len(order) < 3:
         return np.ones(2), np.inf
     step = max((inward[order[-1]] - inward[order[0]]) / (len(order) - 1) / px, 1e-3)
-    dark = _both_show(presence[:, order], max(round(5 / step), 1))
-    first = dark[:max(round(SMOOTH_PX / step), 1)]
+    averaged = FEW_PX * along / SMOOTH_PX
+    dark = _both_show(presence[:, order], np.maximum(np.rint(averaged / step), 1))
+    noise = SURELY * float((sigma / np.sqrt(averaged)).max())
+    first = dark[:max(round(max(along) / step), 1)]
     peak = int(first.argmax())
     height = max(float(first[peak]), PALEST)
-    other = (dark[peak:] < ALIKE * height) | (dark[peak:] * ALIKE > height)
+    other = (dark[peak:] < ALIKE * height - noise) | (dark[peak:] * ALIKE > height + noise)
     until = peak + int(other.argmax()) if other.any() else len(order)
     here = order[(np.arange(len(order)) >= min(peak, 3 / step)) & (np.arange(len(order)) < max(until, peak + 1))]
     dark_here = np.median(_known(presence[:, here]), axis=1)
@@ -121,10 +153,11 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
     return mean, float(np.sqrt(p @ (lengths - mean)**2))
 
 
-def _both_show(presence: np.ndarray, strips: int) -> np.ndarray:
+def _both_show(presence: np.ndarray, strips: int | np.ndarray) -> np.ndarray:
     """(N,) darkness that both planes show at least, of (2, N) presence averaged over so many strips: what only one
     shows is another line."""
-    return cv2.blur(_known(presence), (strips, 1), borderType=cv2.BORDER_REPLICATE).min(axis=0)
+    return np.min([cv2.blur(row[None], (max(int(n), 1), 1), borderType=cv2.BORDER_REPLICATE)[0]
+                   for row, n in zip(_known(presence), np.broadcast_to(strips, 2))], axis=0)
 
 
 def _known(presence: np.ndarray) -> np.ndarray:
@@ -209,7 +242,9 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     cost, a, blur = cost[best, *both], a[best, *both], np.array(blurs_px)[best]
     lowest = cost.argmin(axis=2)
     noise = 1 / (information(z[*both, lowest], a[*both, lowest], blur) + 1e-12)
-    seen_sigma = np.sqrt(noise + model)
+    # in noise the edge may be one of several
+    alone = _spread(wide[:, None], cost)
+    seen_sigma = np.sqrt(np.maximum(noise, np.where(alone * px_per_m[:, None] > COARSE_PX, alone, 0.0)**2) + model)
     counts = (noise / (noise + model))[:, :, None]      # the more foreshortened a plane sees the end, the less
     fine = (wide[e, (cost * counts).sum(axis=1).argmin(axis=1)][:, None]
             + np.arange(-1.0, 1.01, FINE_PX) / px_per_m[:, None])
@@ -217,11 +252,8 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
     fine_cost = (fine_cost * counts).sum(axis=1)
     k = fine_cost.argmin(axis=1)
     sigma = (1 / (1 / (information(z[e, :, k], a[e, :, k], blur) + 1e-12) + model)).sum(axis=1) ** -0.5
-    total = cost.sum(axis=1)
-    posterior = np.exp(-0.5 * (total - total.min(axis=1, keepdims=True)))
     at = np.array([_lowest(f, c) for f, c in zip(fine, fine_cost)])
-    spread = np.sqrt((posterior * (wide - at[:, None])**2).sum(axis=1) / posterior.sum(axis=1))
-    # in noise the edge may be one of several
+    spread = _spread(wide, cost.sum(axis=1))
     sigma = np.where(spread * px_per_m > COARSE_PX, np.maximum(sigma, spread), sigma)
     ends = []
     for i in e:
@@ -237,6 +269,13 @@ def locate(s: np.ndarray, presence: np.ndarray, sigma: np.ndarray, speed: np.nda
         else:
             ends.append(End(float(guess[i]), float('inf'), np.full(2, np.nan), np.full(2, np.nan)))
     return ends
+
+
+def _spread(x: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """(...) m that (..., C) places x with such costs lie from the best one, root mean square."""
+    posterior = np.exp(-0.5 * (cost - cost.min(axis=-1, keepdims=True)))
+    best = np.take_along_axis(np.broadcast_to(x, cost.shape), cost.argmin(axis=-1)[..., None], axis=-1)
+    return np.sqrt((posterior * (x - best)**2).sum(axis=-1) / posterior.sum(axis=-1))
 
 
 def _lowest(x: np.ndarray, y: np.ndarray) -> float:

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter1d
 from ...geometry.cameras import pixels_per_metre
 from ...geometry.curve import middle
 from ...imaging.strips import Measurement, Sheet, cut
-from ..fit.fit import Fit
 from ..fit.neighbours import APART_PX, dark_along
+from ..fit.result import Fit
 from ..fit.solver import Layout, solve
 
 STEP = 3                # px, between the strips
