@@ -50,7 +50,7 @@ def bent_on(sheet: Sheet, spline: Spline3, ends: tuple[float, float], step: floa
         presence = dark.mean(axis=-1) if last else dark.max(axis=-1)
         # at most a right angle: what turns back runs along the device itself
         presence *= np.linalg.norm(bends, axis=-1)[..., None] * px * step < np.pi / 2
-        seen = goes_on(presence / clutter, 1 / clutter, moved, ARCS if last else len(FAN))
+        seen = goes_on(presence / clutter, 1 / clutter, moved, ARCS)
         # what was known of the device before its end does not count
         known = nats((1 / clutter).min(axis=0)[..., 0, 0], 1) * back
         farther = np.where(more, np.maximum((seen.max(axis=(2, 3)) - known).max(axis=1), 0.0), 0.0)
