@@ -135,11 +135,12 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
     band. (0, 0) where there is no band.
     """
     inside, past = (inward > 0) & (inward < inner), inward < -px
-    behind = (inward > inner + 2 * px) & (inward < inner + LOCAL_PX * px)
-    if inner > BAND or not inside.any() or behind.sum() < 6 or past.sum() < 6:
+    behind = [(inward > inner + 2 * px) & (inward < inner + n * px) for n in (SMOOTH_PX + 2, LOCAL_PX)]
+    if inner > BAND or not inside.any() or behind[0].sum() < 6 or past.sum() < 6:
         return 0.0, 0.0
     y = np.nan_to_num(presence)
-    band, pale = (np.median(y[:, m], axis=1) for m in (inside, behind))
+    band, *pale = (np.median(y[:, m], axis=1) for m in (inside, *behind))
+    pale = np.minimum(*pale)        # a braid or coil may begin not far behind the band
     if (pale > ALIKE * band).any():
         return 0.0, 0.0
     pale, out = np.maximum(pale, PALEST), -inward[past]
