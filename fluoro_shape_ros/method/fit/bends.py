@@ -9,7 +9,7 @@ from scipy.ndimage import uniform_filter1d
 from ...geometry.curve import arcs
 from ...geometry.spline import Spline3
 from ...imaging.strips import Sheet, cut, depths
-from .ends import GOES_ON, PALEST, PRESENT, SMOOTH_PX, SURE, goes_on, nats
+from .ends import GOES_ON, OUTWARD, PALEST, PRESENT, SMOOTH_PX, SURE, goes_on, nats
 
 STEP_PX = 3             # between places on an arc
 BACK_PX = 0, 8, 16      # inside the end, where it may begin: a fit overshoots the bend
@@ -31,14 +31,13 @@ def bent_on(sheet: Sheet, spline: Spline3, ends: tuple[float, float], step: floa
     reach_px: how far past them.
     """
     both, px = np.arange(2), np.arange(2 * STEP_PX, reach_px + max(BACK_PX), STEP_PX)
-    outward = np.array([-1, 1])
     clutter = np.maximum((clutter / usual).T, PALEST)[:, :, None, None, None]       # planes, ends
     back, bend = np.tile(BACK_PX, (2, 1)), np.zeros((2, len(BACK_PX), 2))
     more = ~open_end
     for apart, beside in zip(APART, BESIDE_PX):
-        s = np.array(ends)[:, None] - outward[:, None] * back * step                                # (2, B)
+        s = np.array(ends)[:, None] - OUTWARD[:, None] * back * step                                # (2, B)
         points, tangents = (x.reshape(*s.shape, 1, 3) for x in spline.lines(s.ravel()))
-        tangents *= outward[:, None, None, None] / np.linalg.norm(tangents, axis=-1, keepdims=True)
+        tangents *= OUTWARD[:, None, None, None] / np.linalg.norm(tangents, axis=-1, keepdims=True)
         bends = bend[:, :, None] + apart * FAN                                                      # (2, B, C, 2)
         curvature = bends @ _across(tangents[:, :, 0])                                              # (2, B, C, 3)
         places, along = arcs(points, tangents, curvature, px * step)
@@ -65,7 +64,7 @@ def bent_on(sheet: Sheet, spline: Spline3, ends: tuple[float, float], step: floa
         begin = gain.max(axis=2).argmax(axis=1)
         best = gain[both, begin].argmax(axis=1)
         back, bend = back[both, begin][:, None], bends[both, begin, best][:, None]
-    start, stop = ends - outward * back[:, 0] * step * more
+    start, stop = ends - OUTWARD * back[:, 0] * step * more
     arc = both, begin, best
     on = [p[:n + 1] if on else p[:0] for p, n, on in zip(places[arc], far[arc], more)]
     return farther, np.concatenate([on[0][::-1], spline(np.linspace(start, stop, 400)), on[1]])
