@@ -138,8 +138,8 @@ def _fitted(scenes: Sequence[Curves]) -> Judge:
     X, right = np.concatenate([s.features for s in scenes]), np.concatenate([s.right for s in scenes])
     share = np.concatenate([np.full(len(s.right), 1 / np.sqrt(len(s.right))) for s in scenes])
     share /= share.sum()
-    typical = np.median(X[right], axis=0)
-    scale = np.maximum(1.4826 * np.median(np.abs(X[right] - typical), axis=0), 0.25 * X.std(axis=0) + 1e-6)
+    typical = np.nanmedian(X[right], axis=0)    # what is not known is NaN
+    scale = np.maximum(1.4826 * np.nanmedian(np.abs(X[right] - typical), axis=0), 0.25 * np.nanstd(X, axis=0) + 1e-6)
     parts = -np.concatenate(worse(X, typical, scale), axis=1)
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:

@@ -29,6 +29,8 @@ MEAN, MEAN_PX = 0.3e-3, 1.0     # m, or px at the device: right is a curve whose
 TIP, TIP_PX = 1e-3, 3.0         # ... and its tip within the larger of these
 PARTS, FEW = 3, 3       # of a device that are looked at apart for its width, of so many blocks at least
 FAINTEST, CLEAREST = 0.3, 60.0      # signal to noise: less and more say no more
+NEAR_END, PALE = 8, 0.2     # blocks, whose darkness is usual at an end, and the least of the usual that it is taken for
+APART_PX, MOVED_PX = (0.1, 50.0), (0.1, 10.0)      # less and more say no more, too
 FARTHEST = 50.0         # nats, that some 50 px of a device say that is seen beyond doubt
 FAR_OFF_PX = 3.0        # of the device from the curve: more says no more
 SKETCHED_PX = 2         # between the strips of a curve that was not fitted
@@ -48,17 +50,19 @@ class Features:
     residual: float     # px rms, of the device from the curve, averaged over blocks, beyond what noise explains
     sigma: float        # ln of the curve's, as a share of what it may be off by
     uneven: float       # ln of how abruptly it bends at most, beyond what is usual
-    tip_stops: float    # how much darker it is before its tip than past it, as a share of its darkness
-    tip_shown: float    # darkness of its last BLOCK before the tip, as a share of its darkness
+    tip_stops: float    # how much darker it is before its tip than past it, as a share of its darkness around there
     base_stops: float   # as tip_stops
     tip_sigma: float    # ln of the tip's, as a share of what it may be off by
     base_sigma: float   # ln of the base's along the curve, in the same way
+    tip_apart: float    # ln of how far apart the planes may see the tip, px; NaN where not both tell
+    base_apart: float   # as tip_apart
     tip_aside: float    # darkness of a line beside where it would go on past its tip, as far as both planes show it:
                         # geometric mean
     tip_farther: float  # nats by which both planes show it going on past its tip, as a share of FARTHEST
     no_tip: float       # 1 where it leaves the field at both ends
+    no_base: float      # 1 where it leaves the field at its base: that the planes see one end there speaks for a curve
     length: float       # ln of the share of an image's diagonal
-    hidden: float       # ends that only one plane shows
+    restless: float     # ln of px, that the fit still moved by in the end
 
 
 NAMES = tuple(f.name for f in fields(Features))
@@ -70,23 +74,33 @@ def features(fit: Fit, sheet: Sheet, radius: float, tip_is_last: bool) -> np.nda
     seen, count = _seen(fit.spline, fit.start, fit.stop, step, sheet, radius)
     tip = int(tip_is_last)
     stops = np.min([p['stops'] for p in seen], axis=0)
-    shown = np.min([p['shown'] for p in seen], axis=0)
-    stops[fit.open_end], shown[fit.open_end] = 1.0, 1.0
+    stops[fit.open_end] = 1.0
+    apart_px = _apart(fit) / step
     sigma = np.array([np.hypot(fit.end_sigma[tip], _across(fit, (fit.start, fit.stop)[tip])), fit.end_sigma[1 - tip]])
     tip_sigma, base_sigma = np.log(np.clip(sigma / max(TIP, TIP_PX * step), 0.01, 10.0))
     between = (fit.s > fit.start) & (fit.s < fit.stop)
     return np.array([
         *_everywhere(seen), max(_left_over(o[between]) for o in fit.offset_px.T),
         np.log(np.clip(np.sqrt(np.trace(fit.covariance) / len(fit.covariance)) / max(MEAN, MEAN_PX * step), 0.01, 100)),
-        _uneven(fit), stops[tip], shown[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, base_sigma,
+        _uneven(fit), stops[tip], stops[1 - tip], 0.0 if fit.open_end[tip] else tip_sigma, base_sigma,
+        *np.log(np.clip([apart_px[tip], apart_px[1 - tip]], *APART_PX)),
         np.sqrt(np.clip(fit.aside[tip], 0.0, 2.0).prod()), min(fit.farther[tip] / FARTHEST, 1.0),
-        fit.open_end.all(), np.log(count / _diagonal_px(sheet)), (fit.alone >= 0).sum()], float)
+        fit.open_end.all(), fit.open_end[1 - tip], np.log(count / _diagonal_px(sheet)),
+        np.log(np.clip(fit.moved_px, *MOVED_PX))], float)
 
 
 def _across(fit: Fit, s: float) -> float:
     """m, the standard deviation of where a fit runs at an arc length."""
     basis = fit.spline.bases(np.array([s]), 0)[0][0]
     return float(np.sqrt(sum(basis @ fit.covariance[k::3, k::3] @ basis for k in range(3))))
+
+
+def _apart(fit: Fit) -> np.ndarray:
+    """(2,) m by which the planes may see its first and its last end apart: their difference and its standard deviation;
+    NaN where not both tell."""
+    if fit.seen_at is None or fit.seen_sigma is None:
+        return np.full(2, np.nan)
+    return np.hypot(np.ptp(fit.seen_at, axis=1), np.hypot(*fit.seen_sigma.T))
 
 
 def _left_over(offset_px: np.ndarray) -> float:
@@ -196,20 +210,21 @@ def _plane(strips: Strips, v: int, half: float, radius_px: float, count: int, bl
     parts = np.array_split(shadow, PARTS) if number >= PARTS * FEW else [shadow]
     width = min((_width(p, x[near]) / np.hypot(radius_px / 2, BLUR_PX) for p in parts),
                 key=lambda w: abs(np.log(max(w, 1e-3))))
-    each = dark[:, np.abs(x) <= 1].max(axis=1) / usual
-    ends = [(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()),
-            (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())]
+    each = dark[:, np.abs(x) <= 1].max(axis=1)
+    ends = np.array([(each[PAST:PAST + block].mean(), each[:PAST - 4].mean()),
+                     (each[PAST + count - block:PAST + count].mean(), each[PAST + count + 4:].mean())])
+    around = np.clip([middle(on[:NEAR_END]), middle(on[-NEAR_END:])], PALE * usual, usual)
     odd_share = np.sqrt(max((odd**2 - odd_error**2).sum(), 0.0) / ((even**2).sum() + 1e-12))
     return dict(run=float(run.min()), share=float((ratio > CLEAR).mean()), odd=min(float(odd_share), 2.0),
                 width=float(np.log(np.clip(width, 0.3, 3.0))),
-                stops=np.clip([i - o for i, o in ends], -1, 2), shown=np.clip([i for i, _ in ends], 0, 1.5))
+                stops=np.clip((ends[:, 0] - ends[:, 1]) / around, -1, 2))
 
 
 def _width(shadow: np.ndarray, x: np.ndarray) -> float:
     """Standard deviation in px of the shadows (N, W) at (W,) offsets, as far as they are clear; a cylinder's chords
     have half its radius."""
     even, error = _typical(0.5 * (shadow + shadow[:, ::-1]))
-    positive = even * (even > 2 * error)
+    positive = even * np.clip(even / np.maximum(error, 1e-12) - 1.5, 0, 1)
     return float(np.sqrt((positive * x**2).sum() / (positive.sum() + 1e-12)))
 
 

@@ -33,20 +33,21 @@ PREDICTED = 1.0         # what a prediction that a curve bears out adds to its l
 NEAR, FAR, LIMIT = 0.7, 2.0, 6.0
 # +1: the more the likelier it is right, -1: the less
 SIGNS = dict(weakest=1, seen=1, symmetric=-1, wide=-1, narrow=-1, residual=-1, sigma=-1, uneven=-1, tip_stops=1,
-             tip_shown=1, base_stops=1, tip_sigma=-1, base_sigma=-1, tip_aside=-1, tip_farther=-1, no_tip=-1, length=1,
-             hidden=-1)
+             base_stops=1, tip_sigma=-1, base_sigma=-1, tip_apart=-1, base_apart=-1, tip_aside=-1, tip_farther=-1,
+             no_tip=-1, no_base=-1, length=1, restless=-1)
 REASONS = dict(
     weakest='part of it hardly stands out from what lies beside it',
     seen='one plane does not show all of it', symmetric='one side of it is darker than the other, as at an edge',
     wide='it looks wider than robot_radius', narrow='it looks narrower than robot_radius',
     residual='the planes disagree where it runs', sigma='its course is uncertain',
     uneven='it bends more abruptly than devices do',
-    tip_stops='one plane shows it going on past its tip', tip_shown='one plane hardly shows its tip',
-    base_stops='one plane shows it going on past its base', tip_sigma='where its tip is, is uncertain',
-    base_sigma='where its base is, is uncertain', tip_aside='a line goes on beside its tip',
-    tip_farther='it goes on past its tip', no_tip='it leaves the field at both ends',
-    length='it is short',
-    hidden='only one plane shows one of its ends')
+    tip_stops='one plane shows it going on past its tip', base_stops='one plane shows it going on past its base',
+    tip_sigma='where its tip is, is uncertain', base_sigma='where its base is, is uncertain',
+    tip_apart='the planes hardly see its tip at one place', base_apart='the planes hardly see its base at one place',
+    tip_aside='a line goes on beside its tip', tip_farther='it goes on past its tip',
+    no_tip='it leaves the field at both ends',
+    no_base='its base, outside the field, cannot confirm that both planes show one device',
+    length='it is short', restless='the fit has not come to rest')
 
 
 @dataclass(frozen=True)

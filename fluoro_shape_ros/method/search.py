@@ -20,7 +20,7 @@ from .fit.fit import COARSE, fit
 from .fit.result import Fit
 from .prediction import Guess, borne_out
 from .propose.follow import follow
-from .propose.lines import Hypothesis, Lines, by_lines, candidates
+from .propose.lines import NEARLY, Hypothesis, Lines, by_lines, candidates
 from .propose.other_lines import other_lines
 from .propose.sweep import darkness, sweep
 
@@ -31,10 +31,10 @@ SEEN = 0.6              # ... which must show this share of the line
 HOPELESS = -10.0        # log odds below which a fit that has not come to rest is left there ...
 PROMISING = -12.0       # ... and up to which nothing is worth a closer look ...
 CLOSER = 8              # ... at so many more hypotheses
-AS_PROPOSED = 2         # hypotheses that are fitted in the order in which they were proposed; the others in that of
-                        # what is seen of them at first sight ...
+AS_PROPOSED = 2         # hypotheses, and all that are NEARLY as strong, that are fitted in the order in which they were
+                        # proposed; the others in that of what is seen of them at first sight ...
 BENDS = 3               # arcs on which it may go on past its ends, one after another
-FITTED = 8              # ... as long as there are fewer than so many
+FITTED = 12             # ... as long as there are fewer than so many
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +98,17 @@ class Search:
         """False before each step that takes long."""
         sheet, radius = self._sheet, self._radius
         self.tried += [Attempt(f, (None, None), *self._judge(f)) for f in leads if _long_enough(f, self._min_length_px)]
+        lines: tuple[list[Candidate], list[Candidate]] = ([], [])
         for faint in (False, True):
             if self._settled():
                 break
             yield False
             found = candidates(sheet, radius, self._min_length_px, faint)
             if not faint:
-                self.lines = tuple(lines[0].points_px if lines else None for lines in found)
-            hypotheses = by_lines(sheet.views, found)
+                self.lines = tuple(c[0].points_px if c else None for c in found)
+            lines = lines[0] + found[0], lines[1] + found[1]    # one plane may show clearly what the other hardly does
+            before = [t.lines for t in self.tried]
+            hypotheses = (h for h in by_lines(sheet.views, lines) if h.lines not in before)
             yield from self._try(hypotheses if self._first_sight is None
                                  else _most_promising(hypotheses, self._first_sight))
         if not self._settled() and (self._guess is not None or any(t.log_odds > PROMISING for t in self.tried)):
@@ -113,15 +116,20 @@ class Search:
             yield from self._try(_at_most(CLOSER, _again(sheet, radius, found, self.tried, self._guess)))
 
     def _try(self, hypotheses: Iterator[Hypothesis | None]) -> Iterator[bool]:
-        """Fit each; once one is beyond doubt, only the same lines read the other way round,
-        and these however late it is."""
-        last = None
+        """Fit each; once one is beyond doubt, only what was proposed NEARLY as strongly, and the same lines read the
+        other way round, these however late it is."""
+        last, strongest = None, 0.0
         for h in hypotheses:
             if h is None:
+                if self._settled():
+                    break
                 yield False
                 continue
+            strongest = max(strongest, h.score)
             if self._settled() and not (last is not None and any(h.lines) and h.lines == last):
-                break
+                if h.score <= NEARLY * strongest:
+                    break
+                yield False
             last = h.lines
             yield from self._bring_to_rest(h)
 
@@ -155,15 +163,22 @@ def _at_most(count: int, hypotheses: Iterator[Hypothesis | None]) -> Iterator[Hy
 
 
 def _most_promising(hypotheses: Iterator[Hypothesis],
-                    first_sight: Callable[[np.ndarray], float]) -> Iterator[Hypothesis]:
-    """FITTED of them: the first as they come, the others by what is seen of them before any fit; those of the same two
-    lines together."""
-    yield from islice(hypotheses, AS_PROPOSED)
-    others = list(hypotheses)
-    odds = [first_sight(h.curve) for h in others]
+                    first_sight: Callable[[np.ndarray], float]) -> Iterator[Hypothesis | None]:
+    """FITTED of them: the strongest as they come, the others by what is seen of them before any fit; those of the same
+    two lines together. None before each look."""
+    others, odds, strongest, tried = list[Hypothesis](), list[float](), 0.0, 0
+    for h in hypotheses:
+        strongest = max(strongest, h.score)
+        if tried < AS_PROPOSED or tried < FITTED and h.score > NEARLY * strongest:
+            tried += 1
+            yield h
+            continue
+        yield None
+        others.append(h)
+        odds.append(first_sight(h.curve))
     together = [max(o for o, other in zip(odds, others) if other.lines == h.lines) for h in others]
     yield from islice((others[k] for k in sorted(range(len(others)), key=lambda k: (-together[k], -odds[k]))),
-                      FITTED - AS_PROPOSED)
+                      FITTED - tried)
 
 
 def _again(sheet: Sheet, radius: float, found: tuple[list[Candidate], list[Candidate]], tried: list[Attempt],

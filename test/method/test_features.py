@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -76,7 +77,9 @@ def test_there_is_a_finite_number_for_every_name():
 def test_gain_and_offset_of_either_display_tell_nothing(anatomy, planes, change, atol):
     images = [change(i) if k in planes else i for k, i in enumerate(scene(anatomy).frame.images)]
     sheet, f = fitted(images, anatomy=anatomy)
-    assert_same(named(f, sheet), expected(anatomy), atol)
+    apart = ['tip_apart', 'base_apart']         # of some 2 px here, each plane's end to a tenth of that
+    assert_same(named(f, sheet), expected(anatomy), atol, [n for n in NAMES if n not in apart])
+    assert_same(named(f, sheet), expected(anatomy), 2 * atol, apart)
 
 
 @pytest.mark.parametrize('anatomy', [False, True])
@@ -207,7 +210,7 @@ def test_a_curve_that_is_cut_short_is_seen_to_go_on(anatomy, share):
 def test_a_curve_that_is_too_long_is_not_shown_there(anatomy):
     sheet, f = known(anatomy)
     whole, longer = expected(anatomy), named(replace(f, stop=f.stop + 20 * (f.s[1] - f.s[0])), sheet)
-    assert longer['tip_shown'] < 0.3 < 0.7 < whole['tip_shown'] and longer['tip_stops'] < 0.3
+    assert longer['tip_stops'] < 0.3 < 0.6 < whole['tip_stops']
 
 
 @pytest.mark.parametrize('plane', [0, 1])
@@ -229,8 +232,21 @@ def test_where_it_leaves_the_field_an_end_says_nothing_against_it():
     sheet, f = known()
     f = replace(f, start=f.start + 0.01, stop=f.stop - 0.01, aside=np.zeros((2, 2)))
     leaves = named(replace(f, open_end=np.array([False, True])), sheet)
-    assert leaves['tip_stops'] == leaves['tip_shown'] == 1
-    assert named(f, sheet)['tip_stops'] < 0.5
+    assert leaves['tip_stops'] == 1 and named(f, sheet)['tip_stops'] < 0.5
+
+
+def test_an_end_of_a_paler_part_stops_as_much_as_any():
+    """The tip's half is half as dark: it stops by all of what it is."""
+    images, gone = scene(False).frame.images, run(False).without_device().images
+    sheet, f = known()
+    paler = []
+    for k, (image, without) in enumerate(zip(images, gone)):
+        far = np.full(image.shape, 255, np.uint8)
+        far[tuple(np.rint(project(VIEWS[k].P, f.curve(400))[200:, ::-1]).astype(int).T)] = 0
+        near = cv2.distanceTransform(far, cv2.DIST_L2, 5) < 12
+        paler.append(np.where(near, (image.astype(float) + without) / 2, image).astype(image.dtype))
+    paler = named(f, sheet_of(paler, [field_of_view(i) for i in paler], VIEWS, 'dark'))
+    assert_allclose(paler['tip_stops'], expected()['tip_stops'], atol=0.15)
 
 
 def test_the_shape_by_hand():
@@ -247,7 +263,14 @@ def test_the_shape_by_hand():
 
 def test_what_is_handed_on():
     sheet, f = known()
-    assert [named(replace(f, alone=np.array(a)), sheet)['hidden'] for a in ([-1, -1], [0, -1], [1, 0])] == [0, 1, 2]
+    px = f.s[1] - f.s[0]
+    told = named(replace(f, seen_at=np.array([[0, 0], [5, 2]]) * px, seen_sigma=np.array([[3, 4], [0, 4]]) * px,
+                         moved_px=0.5), sheet)
+    assert_allclose([told['base_apart'], told['tip_apart'], told['restless']], np.log([5, 5, 0.5]))
+    by_one = named(replace(f, seen_at=np.full((2, 2), np.nan), seen_sigma=np.full((2, 2), np.nan)), sheet)
+    assert np.isnan([by_one['base_apart'], by_one['tip_apart']]).all()
+    leaves = named(replace(f, open_end=np.array([True, False])), sheet)
+    assert (told['no_base'], leaves['no_base'], leaves['no_tip']) == (0, 1, 0)
     twice = named(replace(f, end_sigma=2 * f.end_sigma, covariance=4 * f.covariance), sheet)
     assert_allclose([twice[n] - expected()[n] for n in ('tip_sigma', 'sigma')], np.log(2))
 

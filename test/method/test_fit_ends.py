@@ -172,6 +172,26 @@ def test_how_dark_a_device_is_at_its_end_and_how_far_that_goes(height, length_px
         assert abs(inner / PX - inner_px) < 3
 
 
+@pytest.mark.parametrize('height', [0.7, 4.0])
+@pytest.mark.parametrize('plane', [0, 1])
+def test_a_part_at_an_end_that_one_plane_alone_shows(height, plane):
+    """As an electrode is no darker than the shaft on a display that is black there already."""
+    inward = np.arange(-16, 16.5, 0.5) * PX
+    p = np.where(inward < 0, 0.0, np.ones((2, 1))) + np.random.default_rng(3).normal(0, 0.05, (2, len(inward)))
+    p[plane, (inward >= 0) & (inward < 9 * PX)] *= height
+    seen, inner = level(p, inward, PX, np.full(2, 0.05))
+    assert_allclose(seen, np.where(np.arange(2) == plane, height, 1), rtol=0.1)
+    assert abs(inner / PX - 9) < 1
+
+
+def test_the_fading_of_a_slanted_end_is_no_part_of_its_own():
+    inward = np.arange(-16, 16.5, 0.5) * PX
+    fading = np.clip(0.5 + inward / (12 * PX), 0, 1)       # 6 px to either side
+    seen, inner = level(np.stack([fading, fading]), inward, PX, fade=np.full(2, 6 * PX))
+    assert_allclose(seen, 1, atol=0.02)
+    assert inner == np.inf and level(np.stack([fading, fading]), inward, PX)[1] < np.inf
+
+
 @pytest.mark.parametrize('tip_px, clutter, expected_px, unsure_px', [(3, 0.03, 3, 0.6), (0, 0.03, 0, 0.6)])
 def test_a_pale_tip_past_a_band_is_measured_where_it_is_seen(tip_px, clutter, expected_px, unsure_px):
     inward = np.arange(-16, 16.5, 0.5) * PX

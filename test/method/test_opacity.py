@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fluoro_shape_ros.geometry.cameras import slant
-from fluoro_shape_ros.method.fit.opacity import RIM, USUAL, bulge, exponent, rim
+from fluoro_shape_ros.method.fit.opacity import RIM, USUAL, bulge, exponent, of_part, rim
 
 SINE = np.stack([np.linspace(0.4, 1, 240), np.linspace(0.9, 0.5, 240)])
 ALL = np.ones(SINE.shape, bool)
@@ -51,6 +51,17 @@ def test_bulge_by_hand():
     half = -np.log(1 - 0.5 * (1 - np.exp(-x))) / x
     assert_allclose(bulge(0.001, slanted, x / np.expm1(x)), RIM * (1 - 2 * half) * rim(0.001, slanted),
                     rtol=1e-3)
+
+
+def test_a_darker_part_is_more_opaque():
+    """A shaft that takes 20 % of the beam, a part of it that takes 40 %, and an electrode that takes all."""
+
+    def power(taken):
+        return -np.log(1 - taken) * (1 - taken) / taken     # x / (exp(x) - 1)
+
+    assert_allclose(of_part(power(0.2), np.array([1.0, 2.0, 5.0, 9.0])), [power(0.2), power(0.4), 0, 0], atol=2e-3)
+    assert of_part(power(0.6), np.array(0.5)) == pytest.approx(power(0.3), abs=2e-3)
+    assert of_part(1.0, np.array(1.0)) == pytest.approx(USUAL, abs=2e-3)      # there is no device that takes nothing
 
 
 def test_the_angle_of_rays_by_hand():

@@ -193,6 +193,16 @@ def test_what_is_beyond_doubt_ends_the_search_but_for_the_same_lines_read_the_ot
     assert fitted[0] is scene.truth and fitted[1] is hypotheses[1].curve
 
 
+@pytest.mark.parametrize('score, tried', [(0.9, 2), (0.5, 1)])
+@pytest.mark.parametrize('ranked', [False, True])
+def test_what_is_beyond_doubt_is_compared_with_what_was_proposed_nearly_as_strongly(scene, sheet, monkeypatch, score,
+                                                                                    tried, ranked):
+    strong = [Hypothesis(scene.truth, lines(scene.truth), score=s) for s in (1.0, score, 0.1)]
+    fitted, asked = counted(monkeypatch, strong)
+    searched(sheet, settles=always, first_sight=(lambda points: 0.0) if ranked else None)
+    assert len(fitted) == tried and asked == [False]
+
+
 def test_what_is_in_doubt_is_compared_with_everything(scene, sheet, monkeypatch):
     plain, faint = ([Hypothesis(scene.truth, lines(scene.truth)) for _ in range(n)] for n in (3, 2))
     fitted, asked = counted(monkeypatch, plain, faint)
@@ -205,6 +215,24 @@ def test_faint_lines_are_looked_for_where_plain_ones_do_not_settle_it(scene, she
     fitted, asked = counted(monkeypatch, [off], [there, off])
     searched(sheet, judge=lambda *_: (np.zeros(0), float(len(asked)), True), settles=lambda odds: odds > 1)
     assert [f is there.curve for f in fitted] == [False, True] and asked == [False, True]
+
+
+def test_a_clear_line_of_one_plane_is_paired_with_a_faint_one_of_the_other(scene, sheet, monkeypatch):
+    (a, b), pairs = lines(scene.truth), []
+    monkeypatch.setattr(search, 'candidates',
+                        lambda sheet, radius, min_length_px, faint: ([], [b]) if faint else ([a], []))
+    monkeypatch.setattr(search, 'by_lines', lambda views, found: pairs.append(found) or iter(()))
+    monkeypatch.setattr(search, '_again', lambda *_: iter(()))
+    searched(sheet, settles=never)
+    assert pairs == [([a], []), ([a], [b])]
+
+
+def test_no_pair_of_lines_is_tried_twice(scene, sheet, monkeypatch):
+    once, again = lines(scene.truth), lines(scene.truth)
+    fitted, asked = counted(monkeypatch, [Hypothesis(scene.truth, once)],
+                            [Hypothesis(scene.truth, once), Hypothesis(scene.truth, again)])
+    tried, _ = searched(sheet, settles=never)
+    assert [t.lines for t in tried] == [once, again] and asked == [False, True]
 
 
 def test_a_lead_beyond_doubt_needs_no_search(chosen, sheet, monkeypatch):

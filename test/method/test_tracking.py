@@ -158,7 +158,8 @@ def test_what_stands_as_it_stood_when_everything_was_searched_needs_no_other_sea
         again = reconstruct(second.frame, CONFIG, prior)
         assert 'search' in again.stage_seconds and again.searched.log_odds != likelier.log_odds
     # what is refused as it was, another search would refuse, too
-    refused = reconstruct(second.frame, CONFIG.replace(min_confidence=0.9995), known)
+    surer = 1 - 0.5 * (1 - answer.confidence)
+    refused = reconstruct(second.frame, CONFIG.replace(min_confidence=surer), known)
     assert refused.outcome is Outcome.LOW_CONFIDENCE and refused.searched is found.searched
     assert 'search' not in refused.stage_seconds
 

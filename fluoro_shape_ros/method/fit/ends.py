@@ -16,10 +16,11 @@ BRIDGED_PX = 70         # a stretch that not both planes show does not end the d
 SMOOTH_PX = 9           # along which darkness is averaged, where a device is clearly seen ...
 CLEARLY, LONGEST_PX = 5.0, 63   # ... by so many standard deviations; else, up to so many px, along what makes it so
 LOCAL_PX = 27           # at an end, that tell how dark the device is there
-FEW_PX, SURELY = 5.0, 1.5   # ... and by so many standard deviations of the mean of so many px
 PALEST = 0.03           # of the usual darkness: a paler device is not told from a background that is no parabola
-ALIKE, SHORTEST_PX = 0.55, 4.0  # of the darkness at an end: what differs more is another part of the device, but not
-                                # within so many px
+EDGE_PX, SHORTEST_PX = 1.5, 4.0     # from an end on that its edge is over, and the least there that may be a part of
+                                    # its own
+VARIES = 0.1            # share that a device's darkness varies by along it
+ALIKE = 0.75            # of a band's darkness: what lies behind it is paler, or it is none
 BAND, SOFT_TIP = 2e-3, 2e-3     # m: longest marker band (electrodes are longer), and farthest that a device goes on
                                 # past one at its end
 SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing
@@ -95,33 +96,34 @@ def supported(presence: np.ndarray, clutter: np.ndarray, step_px: int = 1, gap_p
     return (start + first, stop - 1 - last) if (stop - 1 - last - start - first) * step_px >= 5 else None
 
 
-def level(presence: np.ndarray, inward: np.ndarray, px: float,
-          sigma: np.ndarray = NOISELESS) -> tuple[np.ndarray, float]:
+def level(presence: np.ndarray, inward: np.ndarray, px: float, sigma: np.ndarray = NOISELESS,
+          fade: np.ndarray = NOISELESS) -> tuple[np.ndarray, float]:
     """(2,) darkness of the device at an end in each plane, and how far inside that it surely stays so, in the units of
-    `inward`: a band, or a pale tip, may be short.
+    `inward`: a band, a pale tip, or what lies in a disk's shadow, may be short.
 
     presence: (2, N), sigma: (2,) its noise over a px; inward: (N,) how far inside the end each strip lies; px: a pixel
-    in these units.
+    in these units; fade: (2,) over which the end itself fades in each plane.
+    The end's part is that up to the change of darkness that explains most in both planes, if that is by GOES_ON nats.
     """
-    along = windows(np.sqrt(SMOOTH_PX) / np.maximum(sigma, 1e-9))
-    longest = max(along) / SMOOTH_PX
-    order = np.nonzero((inward > -0.5 * px) & (inward < longest * LOCAL_PX * px))[0]
+    longer = windows(np.sqrt(SMOOTH_PX) / np.maximum(sigma, 1e-9)) / SMOOTH_PX
+    order = np.nonzero((inward > -0.5 * px) & (inward < max(longer) * LOCAL_PX * px))[0]
     order = order[np.argsort(inward[order])]
     if len(order) < 3:
         return np.ones(2), np.inf
-    step = max((inward[order[-1]] - inward[order[0]]) / (len(order) - 1) / px, 1e-3)
-    averaged = FEW_PX * along / SMOOTH_PX
-    dark = _both_show(presence[:, order], np.maximum(np.rint(averaged / step), 1))
-    noise = SURELY * float((sigma / np.sqrt(averaged)).max())
-    first = dark[:max(round(max(along) / step), 1)]
-    peak = int(first.argmax())
-    height = max(float(first[peak]), PALEST)
-    other = (dark[peak:] < ALIKE * height - noise) | (dark[peak:] * ALIKE > height + noise)
-    until = peak + int(other.argmax()) if other.any() else len(order)
-    here = order[(np.arange(len(order)) >= min(peak, 3 / step)) & (np.arange(len(order)) < max(until, peak + 1))]
-    dark_here = np.median(_known(presence[:, here]), axis=1)
-    inner = max(inward[order[min(until, len(order) - 1)]], SHORTEST_PX * px) if other.any() else np.inf
-    return np.maximum(dark_here, PALEST), float(inner)
+    x, y = inward[order], _known(presence[:, order])
+    step = max((x[-1] - x[0]) / (len(x) - 1) / px, 1e-3)
+    full = x > (EDGE_PX * px + fade)[:, None]
+    count, total = np.cumsum(full, axis=1), np.cumsum(y * full, axis=1)
+    rest: np.ndarray = count[:, -1:] - count
+    apart = total / np.maximum(count, 1) - (total[:, -1:] - total) / np.maximum(rest, 1)
+    enough = np.minimum(count, rest) * step >= SHORTEST_PX * longer[:, None]
+    variance = (1 / np.maximum(count, 1) + 1 / np.maximum(rest, 1)) * np.maximum(sigma, VARIES)[:, None]**2 / step
+    tried = max(np.count_nonzero(enough.any(axis=0)), 1)
+    nats = np.where(enough, 0.5 * apart**2 / variance, 0.0).sum(axis=0) - np.log(tried)
+    changes = int(nats.argmax())
+    until = changes + 1 if nats[changes] > GOES_ON else len(x)
+    height = [np.mean(v[:until][f[:until]] if f[:until].any() else v[:until]) for v, f in zip(y, full)]
+    return np.maximum(height, PALEST), float(x[until]) if until < len(x) else np.inf
 
 
 def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: np.ndarray, rim: np.ndarray,
@@ -136,7 +138,7 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
     """
     inside, past = (inward > 0) & (inward < inner), inward < -px
     behind = [(inward > inner + 2 * px) & (inward < inner + n * px) for n in (SMOOTH_PX + 2, LOCAL_PX)]
-    if inner > BAND or not inside.any() or behind[0].sum() < 6 or past.sum() < 6:
+    if inner > BAND + 2 * EDGE_PX * px or not inside.any() or behind[0].sum() < 6 or past.sum() < 6:
         return 0.0, 0.0
     y = np.nan_to_num(presence)
     band, *pale = (np.median(y[:, m], axis=1) for m in (inside, *behind))
@@ -157,8 +159,13 @@ def past_band(presence: np.ndarray, inward: np.ndarray, inner: float, clutter: n
 def _both_show(presence: np.ndarray, strips: int | np.ndarray) -> np.ndarray:
     """(N,) darkness that both planes show at least, of (2, N) presence averaged over so many strips: what only one
     shows is another line."""
-    return np.min([cv2.blur(row[None], (max(int(n), 1), 1), borderType=cv2.BORDER_REPLICATE)[0]
-                   for row, n in zip(_known(presence), np.broadcast_to(strips, 2))], axis=0)
+    return _averaged(presence, strips).min(axis=0)
+
+
+def _averaged(presence: np.ndarray, strips: int | np.ndarray) -> np.ndarray:
+    """(2, N) presence averaged over so many strips."""
+    return np.stack([cv2.blur(row[None], (max(int(n), 1), 1), borderType=cv2.BORDER_REPLICATE)[0]
+                     for row, n in zip(_known(presence), np.broadcast_to(strips, 2))])
 
 
 def _known(presence: np.ndarray) -> np.ndarray:

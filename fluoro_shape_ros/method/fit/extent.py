@@ -13,7 +13,7 @@ from ...geometry.cameras import projection_jacobian, slant
 from ...geometry.curve import middle
 from ...geometry.spline import Spline3
 from .ends import BLURS_PX, OUTWARD, SMOOTH_PX, End, level, locate, past_band
-from .opacity import bulge, exponent, rim
+from .opacity import bulge, exponent, of_part, rim
 from .result import Fit, Rest
 
 # strips around an end, and how far from the first guess it is looked for
@@ -34,7 +34,7 @@ def extent(found: Rest, aside: np.ndarray, farther: np.ndarray, look: Callable, 
     """
     f, ends = _first_extent(found, aside, farther, views, radius)
     f = replace(f, covariance=_confirmed(f, ends, views))
-    return _see_ends(look, f, ends, views, radius, *found.at_ends)
+    return _see_ends(look, f, ends, views, radius, *found.at_ends, found.typical)
 
 
 def _first_extent(found: Rest, aside: np.ndarray, farther: np.ndarray, views: Sequence[View],
@@ -50,12 +50,14 @@ def _first_extent(found: Rest, aside: np.ndarray, farther: np.ndarray, views: Se
     inward = OUTWARD[:, None] * (np.array(reference)[:, None] - s)
     usual, beside = found.at_ends
     noise = np.maximum(seen.presence_sigma, np.sqrt(SMOOTH_PX) * beside / np.nan_to_num(usual, nan=1e-9))
-    height, inner = _levels(twice(seen.presence), inward, s[1] - s[0], noise)
     sine = _slants(solution.spline, s, views)
+    fade = rim(radius, sine[:, at].T)
+    height, inner = _levels(twice(seen.presence), inward, s[1] - s[0], twice(seen.presence_sigma), fade)
     power = exponent(seen.presence * seen.usual, sine, inside.T & between)
+    at_ends = of_part(power, height * usual / found.typical)
     located = locate(twice(s), twice(seen.presence) / height[..., None], noise / height, twice(strips.speed),
-                     np.array(reference), OUTWARD, bulge(radius, sine[:, at].T, power),
-                     rim(radius, sine[:, at].T), blurs_px=BLURS_PX[1:2], inner=inner)
+                     np.array(reference), OUTWARD, bulge(radius, sine[:, at].T, at_ends), fade,
+                     blurs_px=BLURS_PX[1:2], inner=inner)
     start_stop, ends = [end.at for end in located], list[End | None](located)
     for k in np.nonzero(open_end)[0]:
         dark = np.nonzero(~lit[at[k]:] if k else ~lit[:at[k] + 1][::-1])[0]
@@ -68,10 +70,11 @@ def _first_extent(found: Rest, aside: np.ndarray, farther: np.ndarray, views: Se
                solution.moved_px), ends
 
 
-def _levels(presence: np.ndarray, inward: np.ndarray, px: float, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _levels(presence: np.ndarray, inward: np.ndarray, px: float, sigma: np.ndarray,
+            fade: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(2, 2) and (2,) of ends.level for both ends (rows): of (2, 2, N) presence with (2, 2) noise, at (2, N) arc
-    lengths inside them, m."""
-    height, inner = zip(*(level(p, i, px, n) for p, i, n in zip(presence, inward, sigma)))
+    lengths inside them, m, which fade over (2, 2) m."""
+    height, inner = zip(*(level(p, i, px, n, f) for p, i, n, f in zip(presence, inward, sigma, fade)))
     return np.array(height), np.array(inner)
 
 
@@ -102,9 +105,9 @@ def _slants(spline: Spline3, s: np.ndarray, views: Sequence[View]) -> np.ndarray
 
 
 def _see_ends(look: Callable, f: Fit, ends: list[End | None], views: Sequence[View], radius: float,
-              usual: np.ndarray, clutter: np.ndarray) -> Fit:
+              usual: np.ndarray, clutter: np.ndarray, typical: np.ndarray) -> Fit:
     """The fit with its ends seen once more, by strips laid out from where they are: where strips happen to lie must not
-    count. usual, clutter: (2, 2) at each end (rows) in each plane, see Rest."""
+    count. usual, clutter: (2, 2) at each end (rows) in each plane, typical: (2,) along the curve, see Rest."""
     step, by = f.s[1] - f.s[0], _shown_by_one(f)
     alone = np.array([v if end is not None and v >= 0 and np.isfinite(end.seen_at[v]) and end.disagreed else -1
                       for end, v in zip(ends, by)])
@@ -116,11 +119,13 @@ def _see_ends(look: Callable, f: Fit, ends: list[End | None], views: Sequence[Vi
     presence, speed = (x.reshape(2, 2, -1).transpose(1, 0, 2) for x in (seen.presence, strips.speed))
     sine = _slants(f.spline, at, views).T
     # (ends, planes)
-    noise = np.maximum(seen.presence_sigma.reshape(2, 2).T, np.sqrt(SMOOTH_PX) * clutter
-                       / np.nan_to_num(middle(seen.usual), nan=1e-9).reshape(2, 2).T)
-    height, inner = _levels(presence, -OUTWARD[:, None] * window, step, noise)
-    again = locate(s, presence / height[..., None], noise / height, speed, at, OUTWARD, bulge(radius, sine, f.power),
-                   rim(radius, sine), density=1 / END_STEP_PX, reach_px=END_REACH_PX, inner=inner)
+    local = np.nan_to_num(middle(seen.usual), nan=1e-9).reshape(2, 2).T
+    noise = np.maximum(seen.presence_sigma.reshape(2, 2).T, np.sqrt(SMOOTH_PX) * clutter / local)
+    fade = rim(radius, sine)
+    height, inner = _levels(presence, -OUTWARD[:, None] * window, step, seen.presence_sigma.reshape(2, 2).T, fade)
+    again = locate(s, presence / height[..., None], noise / height, speed, at, OUTWARD,
+                   bulge(radius, sine, of_part(f.power, height * local / typical)), fade, density=1 / END_STEP_PX,
+                   reach_px=END_REACH_PX, inner=inner)
     guess, hard, sigma = at.copy(), crowded(f), np.zeros(2)
     for k, (end, v) in enumerate(zip(ends, alone)):
         if v >= 0 and np.isfinite(again[k].seen_at[v]):

@@ -53,9 +53,16 @@ def exponent(darkness: np.ndarray, sine: np.ndarray, good: np.ndarray) -> float:
     return min(max(slope, 0.0), 1.0)
 
 
-def bulge(radius: float, sine: np.ndarray, power: float) -> np.ndarray:
+def of_part(power: float, share: np.ndarray) -> np.ndarray:
+    """(...) exponent of parts of a device that are (...) `share` times as dark as those whose exponent is `power`:
+    Beer-Lambert, 1 - exp(-x)."""
+    depth = np.interp(min(power, USUAL), _EXPONENTS[::-1], _DEPTHS[::-1])
+    return np.interp(-np.log1p(-np.minimum(share * -np.expm1(-depth), 1 - 1e-9)), _DEPTHS, _EXPONENTS)
+
+
+def bulge(radius: float, sine: np.ndarray, power: np.ndarray) -> np.ndarray:
     """(...) m by which the shadow of a flat end reaches beyond the axis' end, seen at angles of this (...) sine; power:
-    see `exponent`.
+    (...) see `exponent`.
 
     The end's rim is an ellipse, r cos / sin of the angle between ray and axis long. An opaque device shows all of it; a
     translucent one fades from that far before the end to that far after it, and is half as dark in between.

@@ -72,6 +72,13 @@ class Rest:
         return self.measured.usual[:, ends].T, self.clutter[:, ends].T * np.sqrt(self.along_px / SMOOTH_PX)
 
     @property
+    def typical(self) -> np.ndarray:
+        """(2,) darkness of most of the device in each plane."""
+        first, last = self.stretch
+        dark = self.measured.presence[:, first:last + 1] * self.measured.usual[:, first:last + 1]
+        return np.maximum(middle(np.nan_to_num(dark), axis=1), 1e-9)
+
+    @property
     def beyond(self) -> np.ndarray:
         """(2, 2) darkness past the first and the last end (rows) in each plane, see _beyond."""
         presence = self.measured.presence.T

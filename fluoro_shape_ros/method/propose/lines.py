@@ -22,9 +22,9 @@ from .first_curve import first_curve
 
 LINES = 40              # strongest lines of an image that are looked at closely ...
 CANDIDATES = 20         # ... and most device-like ones among them that are compared between the planes
-ALIGNMENTS = 30         # of a line of each plane that are proposed
-FLIPPED = 0.7           # score of a pair of lines read the other way round, as a share of the better way's, that must
-                        # be tried, too
+ALIGNMENTS = 130        # of a line of each plane that are proposed
+NEARLY = 0.7            # score of a pair of lines, or of the same read the other way round, as a share of the best
+                        # one's, that must be tried, too
 UNLIKE, ODD = 0.3, 0.6  # difference to a cylinder's profile (correlation), and to its width (logarithm), that make a
                         # line less likely the device's
 FAINT_LENGTH_PX = 7.0   # sigma along which faint lines are averaged, in px of the smaller image
@@ -43,6 +43,7 @@ class Hypothesis:
     lines: Lines = (None, None) # that say so
     coarse: int = 0             # how often the fit searches around it
     clearing: bool = False      # whether lines beside it are taken away
+    score: float = 0.0          # of the lines that say so, see alignment.Alignment
 
 
 def candidates(sheet: Sheet, radius: float, min_length_px: float,
@@ -65,8 +66,9 @@ def by_lines(views: Sequence[View], found: tuple[list[Candidate], list[Candidate
     for alignment in align(curves[0], curves[1], [np.array([c.score for c in lines]) for lines in found],
                            fundamental(views[0].P, views[1].P), best=ALIGNMENTS):
         a, b = alignment.a, alignment.b
-        if alignment.score >= FLIPPED * scores.setdefault((a, b), alignment.score):
-            yield Hypothesis(first_curve(views, curves[0][a], curves[1][b], alignment), (found[0][a], found[1][b]))
+        if alignment.score >= NEARLY * scores.setdefault((a, b), alignment.score):
+            yield Hypothesis(first_curve(views, curves[0][a], curves[1][b], alignment), (found[0][a], found[1][b]),
+                             score=alignment.score)
 
 
 def _candidates(image: np.ndarray, field: np.ndarray, half_width_px: float, min_length_px: float,
