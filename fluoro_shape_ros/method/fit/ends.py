@@ -26,7 +26,7 @@ BAND, SOFT_TIP = 2e-3, 2e-3     # m: longest marker band (electrodes are longer)
 SURE, ABSENT = 10.0, 1.5        # nats: what SMOOTH_PX px can say at most for the device, and against it where nothing
                                 # is seen, since it may be pale
 ANOTHER = 5.0           # nats against another line that goes on just where the device ends
-GOES_ON = 3.0           # nats past an end, that make one look farther
+GOES_ON = 3.0           # nats past an end that make one look farther, and by which a part at an end is one of its own
 REACH_PX = 20.0         # the edge is looked for this far around the first guess
 COARSE_PX, FINE_PX = 0.8, 0.2  # steps of the search
 BLURS_PX = (0.8, 1.2, 1.9)     # of an edge; the middle one is enough for a first guess
